@@ -17,7 +17,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Study
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study, StudyCurve
 
 FloatArray = NDArray[np.float64]
 
@@ -253,7 +253,7 @@ def _panel(title: str, rows: dict[str, Row], length: float) -> Panel:
         "bias",
         series=(Series("clocks refined", "three-sensor", "bias", points),),
         curves=tuple(
-            Curve(clocks, middle, rows[clocks].bias.mean(axis=1), style)
+            StudyCurve(clocks, middle, rows[clocks].bias.mean(axis=1), style)
             for clocks, style in (("arrival times", "--"), ("oracle", ":"))
         ),
         log="x",

@@ -24,7 +24,7 @@ from daq.bench.model import Bench
 from tests.tui.service.bench_files import HOURLY, SENSORS, FakeSteps, VirtualClock, bench_of
 from tests.virtual_time import Jumping, VirtualTimeLoop
 from tui.service.processes.finish import Outcome
-from tui.service.records.run_state import BandNoise
+from tui.service.records.run_state import RecordedNoise
 from tui.service.records.store import RunStore
 from tui.service.service import Service
 
@@ -148,7 +148,9 @@ def longest_pause(bench: Bench, hours: float) -> tuple[float, int]:
     steps = FakeSteps(bench.recording_directory, check_takes=5.0)
     for _ in range(math.ceil(hours)):
         noise = tuple(
-            BandNoise(f"S{k // 3}", "M", "7", "xyz"[k % 3], "m/s²", "three-sensor", 1.0, 10.0, *psd)
+            RecordedNoise(
+                f"S{k // 3}", "M", "7", "xyz"[k % 3], "m/s²", "three-sensor", 1.0, 10.0, *psd
+            )
             for k, psd in enumerate(rng.uniform(1e-12, 2e-12, (N_CHANNELS, 3)).tolist())
         )
         steps.outcomes.append(Outcome(noise=noise, verdict="pass"))

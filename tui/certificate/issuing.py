@@ -19,7 +19,7 @@ from daq.results.result import Result
 from daq.results.sources import Source, sources
 from tui.certificate.dcc import NAME as DCC_NAME
 from tui.certificate.dcc import dcc
-from tui.certificate.ledger import Entry, HeadSigner, Ledger
+from tui.certificate.ledger import HeadSigner, Ledger, LedgerEntry
 from tui.certificate.verification import JSON_NAME, verified
 from tui.output.json_document import document
 from tui.output.json_values import json_text
@@ -216,7 +216,7 @@ def settings_table(result: Result) -> dict[str, Any]:
     return plain
 
 
-def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[Entry, Path]:
+def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[LedgerEntry, Path]:
     """Issue a certificate: number, file, and both in the ledger.
 
     Parameters

@@ -77,7 +77,7 @@ class LedgerError(HuddleError, OSError):
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class LedgerEntry:
     """One certificate or void number, as the ledger knows it now.
 
     Attributes
@@ -167,7 +167,7 @@ class Ledger:
             self._clear_up()
             yield
 
-    def entries(self) -> tuple[Entry, ...]:
+    def entries(self) -> tuple[LedgerEntry, ...]:
         """Return all certificates and void numbers, in the order in which they were allotted.
 
         Raises
@@ -175,7 +175,7 @@ class Ledger:
         LedgerError
             If a row was changed or removed.
         """
-        found: dict[tuple[str, int], Entry] = {}
+        found: dict[tuple[str, int], LedgerEntry] = {}
         busy = self._is_busy()
         for row, (record, own) in enumerate(self._records(), start=1):
             key = record["number"], record["revision"]
@@ -208,7 +208,7 @@ class Ledger:
         reason: str,
         roots: Mapping[str, str] = MappingProxyType({}),
         signer: str = "",
-    ) -> Entry:
+    ) -> LedgerEntry:
         """Give the next number; a further certificate of the same runs is a revision of theirs."""
         entries = self.entries()
         before = self.last_of(frozenset(run_id for _, run_id, _ in recordings), entries)
@@ -233,7 +233,9 @@ class Ledger:
         }
         return _entry(record, self._add(record), "being issued")
 
-    def last_of(self, runs: frozenset[str], entries: Sequence[Entry] | None = None) -> Entry | None:
+    def last_of(
+        self, runs: frozenset[str], entries: Sequence[LedgerEntry] | None = None
+    ) -> LedgerEntry | None:
         """Return the last certificate of the same runs that is not void."""
         known = self.entries() if entries is None else entries
         found = [each for each in known if each.runs == runs and each.state != "void"]
@@ -269,7 +271,7 @@ class Ledger:
         return last, ""
 
     def publish(
-        self, entry: Entry, suffix: str, content: bytes, signer: HeadSigner | None = None
+        self, entry: LedgerEntry, suffix: str, content: bytes, signer: HeadSigner | None = None
     ) -> Path:
         """Add a certificate to the ledger and to the folder, in which it replaces nothing.
 
@@ -300,7 +302,7 @@ class Ledger:
         _name(part, path)
         return path
 
-    def void(self, entry: Entry, why: str) -> None:
+    def void(self, entry: LedgerEntry, why: str) -> None:
         """Mark a number without a certificate, unless it has one that lacks only its name."""
         if self._is_issued(entry):
             return
@@ -315,7 +317,7 @@ class Ledger:
             }
         )
 
-    def _is_issued(self, entry: Entry) -> bool:
+    def _is_issued(self, entry: LedgerEntry) -> bool:
         key = "issued", entry.number, entry.revision
         return any(key == (r["kind"], r["number"], r["revision"]) for r, _ in self._records())
 
@@ -356,7 +358,7 @@ class Ledger:
 
     def _clear_up(self) -> None:
         """Finish what a killed process left; the lock is held."""
-        open_entries: dict[tuple[str, int], Entry] = {}
+        open_entries: dict[tuple[str, int], LedgerEntry] = {}
         for record, own in self._records():
             key = record["number"], record["revision"]
             if record["kind"] == "allotted":
@@ -486,8 +488,8 @@ def _is_plain(record: Mapping[str, Any]) -> bool:
     return is_file and not set(number) & set("/\\\0") and isinstance(record.get("sha256"), str)
 
 
-def _entry(record: Mapping[str, Any], own: str, state: State) -> Entry:
-    return Entry(
+def _entry(record: Mapping[str, Any], own: str, state: State) -> LedgerEntry:
+    return LedgerEntry(
         number=record["number"],
         revision=record["revision"],
         at=datetime.fromisoformat(record["at"]),

@@ -33,7 +33,7 @@ from daq.recording.signing import problem, signature_of
 from daq.recording.storage.trial import trials
 from tui.certificate.dcc import DCC
 from tui.certificate.dcc import NAME as DCC_NAME
-from tui.certificate.ledger import Entry, Ledger, ledgers_of
+from tui.certificate.ledger import Ledger, LedgerEntry, ledgers_of
 from tui.output.extras import require
 from tui.report.certificate import SPECIMEN
 
@@ -258,7 +258,7 @@ def _without_ledger(
     path: Path, content: bytes, claims: Claims, recordings: Sequence[Path], wanted: str
 ) -> list[str]:
     """Return what a signature alone shows, to who has the certificate and not its ledger."""
-    entry = Entry(
+    entry = LedgerEntry(
         number=claims.number,
         revision=claims.revision,
         at=datetime.now(UTC),
@@ -283,7 +283,7 @@ def _without_ledger(
 
 
 def _against_ledger(
-    path: Path, content: bytes, claims: Claims, entry: Entry, entries: Sequence[Entry]
+    path: Path, content: bytes, claims: Claims, entry: LedgerEntry, entries: Sequence[LedgerEntry]
 ) -> list[str]:
     """Return where a certificate and the ledger differ."""
     wrong = []
@@ -308,7 +308,7 @@ def _against_ledger(
     return wrong
 
 
-def _signatures(content: bytes, entry: Entry, wanted: str) -> tuple[list[str], list[str]]:
+def _signatures(content: bytes, entry: LedgerEntry, wanted: str) -> tuple[list[str], list[str]]:
     """Return who signed, a line each, and what is wrong with that."""
     if b"/ByteRange" not in content:
         wrong = []
@@ -348,7 +348,7 @@ def _signatures(content: bytes, entry: Entry, wanted: str) -> tuple[list[str], l
     return lines, wrong if lines else ["its signature cannot be read"]
 
 
-def _head(ledger: Ledger, entry: Entry, wanted: str) -> tuple[list[str], list[str]]:
+def _head(ledger: Ledger, entry: LedgerEntry, wanted: str) -> tuple[list[str], list[str]]:
     """Return whether the ledger is signed as far as a certificate, and what is wrong with that."""
     if not entry.signer and not wanted:
         return [], []
@@ -364,7 +364,7 @@ def _head(ledger: Ledger, entry: Entry, wanted: str) -> tuple[list[str], list[st
 
 
 def _recordings(
-    path: Path, entry: Entry, recordings: Sequence[Path], ledger: Ledger | None
+    path: Path, entry: LedgerEntry, recordings: Sequence[Path], ledger: Ledger | None
 ) -> list[str]:
     files = [file for file, _, _ in entry.recordings]
     beside = [] if ledger is None else [ledger.folder.parent / file for file in files]

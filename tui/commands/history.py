@@ -20,7 +20,7 @@ from tui.service.records.run_state import utc_text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tui.service.history.series import Found, Series
+    from tui.service.history.series import Found, NoiseSeries
 
 PICTURES = (".png", ".svg", ".pdf")
 _COLUMNS = (
@@ -156,7 +156,7 @@ def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Fou
     return noise
 
 
-def _rows(found: Sequence[Series]) -> Iterator[list[object]]:
+def _rows(found: Sequence[NoiseSeries]) -> Iterator[list[object]]:
     for series in found:
         for (bench, due), noise in zip(series.runs, series.noise, strict=True):
             own = {"bench": bench, "due": utc_text(due), "simulated": series.simulated}

@@ -180,13 +180,13 @@ def first_bench(path: Path, ports: Sequence[str], baud: int | None = None) -> Pa
     """Find sensors and write a bench file; None if that was left."""
     from daq.transport.serial_ports import serial_ports
     from tui.application.first_bench import FirstBenchApp
-    from tui.commands.tui_controls import FirstBenchControls
+    from tui.commands.tui_controls import ComputerControls
     from tui.output.logs.lines import screen_taken
     from tui.runs.first_bench import draft
 
     check_places(str(path))
     searched = list(ports) or [each.path for each in serial_ports()]
-    app = FirstBenchApp(FirstBenchControls(path, searched, draft(path)), _driver(baud))
+    app = FirstBenchApp(ComputerControls(path, searched, draft(path)), _driver(baud))
     app.theme = _theme()
     with screen_taken():
         return app.run()

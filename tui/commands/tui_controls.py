@@ -352,7 +352,7 @@ class BenchControls(_Controls):
 
 
 @dataclass
-class FirstBenchControls:
+class ComputerControls:
     """What the first bench asks of this computer."""
 
     path: Path

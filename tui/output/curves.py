@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Curve(NamedTuple):
+class ExportedCurve(NamedTuple):
     """A curve of each method and channel.
 
     Attributes
@@ -33,16 +33,16 @@ class Curve(NamedTuple):
 
 _END = "end of the 95 % interval of the self-noise"
 CURVES = (
-    Curve(
+    ExportedCurve(
         "noise_psd",
         "noise_psd",
         "noise_psd",
         "noise",
         "one-sided power spectral density of the self-noise",
     ),
-    Curve("noise_low", "low", "noise_psd_low", "low", f"lower {_END}"),
-    Curve("noise_high", "high", "noise_psd_high", "high", f"upper {_END}"),
-    Curve(
+    ExportedCurve("noise_low", "low", "noise_psd_low", "low", f"lower {_END}"),
+    ExportedCurve("noise_high", "high", "noise_psd_high", "high", f"upper {_END}"),
+    ExportedCurve(
         "cov", "cov", "cov", "cov", "coefficient of variation of the self-noise", is_density=False
     ),
 )

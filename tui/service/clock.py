@@ -24,7 +24,7 @@ _FAR = 2**31 - 1
 """Seconds since 1970 at which the timer would end, if the clock were never set."""
 
 
-class Clock(Protocol):
+class ServiceClock(Protocol):
     """Tells the time, and lets it pass."""
 
     def now(self) -> datetime:

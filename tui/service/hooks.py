@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.tables.unattended import Hooks
-    from tui.service.clock import Clock
+    from tui.service.clock import ServiceClock
 
 _SHORTEST_SECRET = 4
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -65,11 +65,11 @@ class HookRunner:
     store : RunStore
     folder : Path
         Of the recordings.
-    clock : Clock
+    clock : ServiceClock
     """
 
     def __init__(
-        self, hooks: Callable[[], Hooks], store: RunStore, folder: Path, clock: Clock
+        self, hooks: Callable[[], Hooks], store: RunStore, folder: Path, clock: ServiceClock
     ) -> None:
         self._hooks, self._store, self._folder, self._clock = hooks, store, folder, clock
         self._queue: asyncio.Queue[Run] = asyncio.Queue()

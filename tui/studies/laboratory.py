@@ -24,7 +24,7 @@ from estimator.types import ComplexArray, FloatArray
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.studies.study import Curve, Panel, Point, ProgressCallback, Series, Study
+from tui.studies.study import Panel, Point, ProgressCallback, Series, Study, StudyCurve
 
 HANN = WelchSettings(
     sampling_rate=paper_scenarios.SAMPLING_RATE, segment_length=2000, overlap=0.5, window="hann"
@@ -76,7 +76,7 @@ class MeasuredSpectra:
         )
 
 
-class Laboratory:
+class LaboratoryStudy:
     """The set-ups' cross-spectral matrices, simulated when first wanted."""
 
     def __init__(self, progress: ProgressCallback, *, length: float = 1.0) -> None:
@@ -257,7 +257,7 @@ def band_series(
 
 
 def _spectra(
-    title: str, record: Curve, noises: tuple[Noise, ...], *, benchmark: Noise | None = None
+    title: str, record: StudyCurve, noises: tuple[Noise, ...], *, benchmark: Noise | None = None
 ) -> Panel:
     """Draw a record and the noise of its first channel."""
     frequency = HANN.frequencies[SHOWN]
@@ -266,22 +266,22 @@ def _spectra(
     if benchmark is not None:
         reference = ("benchmark: E, C, D", benchmark.estimate, "r-")
     curves = [
-        Curve(label, frequency, np.where(psd[:, 0] > 0, psd[:, 0], np.nan), style)
+        StudyCurve(label, frequency, np.where(psd[:, 0] > 0, psd[:, 0], np.nan), style)
         for label, psd, style in (*estimates, reference)
     ]
     return Panel(title, FREQUENCY_LABEL, PSD_LABEL, curves=(record, *curves), log="xy")
 
 
-def _record(measured: MeasuredSpectra, sensor: str) -> Curve:
+def _record(measured: MeasuredSpectra, sensor: str) -> StudyCurve:
     power = measured.of((sensor,)).csm[:, 0, 0].real
-    return Curve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
+    return StudyCurve("motion and noise", HANN.frequencies[SHOWN], power, "k:")
 
 
 def _biases(title: str, *series: Series) -> Panel:
     return Panel(title, FREQUENCY_LABEL, BIAS_LABEL, series=series, log="x")
 
 
-def case(laboratory: Laboratory, number: str) -> tuple[Panel, Panel]:
+def case(laboratory: LaboratoryStudy, number: str) -> tuple[Panel, Panel]:
     """Spectra of one case of Table 1, and the bias of both methods by band."""
     setup, sensors = paper_scenarios.CASES[number]
     measured = laboratory.measured(setup)
@@ -295,18 +295,18 @@ def case(laboratory: Laboratory, number: str) -> tuple[Panel, Panel]:
     )
 
 
-def setup1(laboratory: Laboratory) -> Study:
+def setup1(laboratory: LaboratoryStudy) -> Study:
     """Cases 0, 1 and 2 of Table 1 (Figs. 7 and 10, a to c)."""
     panels = tuple(panel for number in "012" for panel in case(laboratory, number))
     return Study("setup1", "Set-up 1: A and B turned by 60°", panels)
 
 
-def setup2(laboratory: Laboratory) -> Study:
+def setup2(laboratory: LaboratoryStudy) -> Study:
     """Case 3 of Table 1 (Figs. 7d and 10d)."""
     return Study("setup2", "Set-up 2: A, B and E all turned", case(laboratory, "3"))
 
 
-def fig14(laboratory: Laboratory) -> Study:
+def fig14(laboratory: LaboratoryStudy) -> Study:
     """Wider triangles, where coherence fails, and the estimate of all five sensors.
 
     The benchmark is that of the paper: the estimate of case 0.
@@ -331,7 +331,7 @@ def fig14(laboratory: Laboratory) -> Study:
     return Study("fig14", "Wider triangles are less coherent; five sensors know", tuple(panels))
 
 
-def waves(laboratory: Laboratory) -> Study:
+def waves(laboratory: LaboratoryStudy) -> Study:
     """Five sensors of any direction where the motion is far from coherent: beyond the paper."""
     measured = laboratory.measured("waves")
     triangle = estimate(measured, ("E", "C", "D"), "three-sensor", n_channels=3)
@@ -350,7 +350,7 @@ def waves(laboratory: Laboratory) -> Study:
     )
 
 
-def two(laboratory: Laboratory) -> Study:
+def two(laboratory: LaboratoryStudy) -> Study:
     """Two sensors in motion whose level changes: beyond the paper."""
     measured = laboratory.measured("two")
     correlation = bin_correlation(get_window(HANN.window, HANN.segment_length), HANN.hop)
@@ -379,7 +379,7 @@ def _goal(high: float) -> float:
     return 0.05 if high <= 20 else 0.2
 
 
-LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
+LABORATORY: Mapping[str, Callable[[LaboratoryStudy], Study]] = {
     "setup1": setup1,
     "setup2": setup2,
     "fig14": fig14,

@@ -34,7 +34,7 @@ from estimator.types import FloatArray
 from tui.output.console import check_places, for_people, notices, write_json
 from tui.output.extras import require
 from tui.page.table import Table
-from tui.studies.study import Curve, Panel, Study
+from tui.studies.study import Panel, Study, StudyCurve
 
 PUBLIC = "public"
 BOUND = "bound"
@@ -259,7 +259,7 @@ def _study(name: str, title: str, snapshot: Snapshot) -> Study:
                 "frequency (Hz)",
                 f"PSD (({label.unit})²/Hz)",
                 curves=tuple(
-                    Curve(what, snapshot.frequency[used], _positive(psd[used, column]), style)
+                    StudyCurve(what, snapshot.frequency[used], _positive(psd[used, column]), style)
                     for what, psd, style in curves
                 ),
                 log="xy",

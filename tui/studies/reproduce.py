@@ -15,7 +15,7 @@ from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
 from tui.page.table import Cell, Table
-from tui.studies.laboratory import LABORATORY, Laboratory
+from tui.studies.laboratory import LABORATORY, LaboratoryStudy
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE, ProgressCallback, Series, Study
 
@@ -35,7 +35,7 @@ DEFAULT_FOLDER = Path("reproduced")
 def paper(progress: ProgressCallback, length: float) -> Mapping[str, Callable[[], Study]]:
     """Return the studies of the paper by name; they share what they simulate."""
     ingredients = Ingredients(progress, length=length)
-    laboratory = Laboratory(progress, length=length)
+    laboratory = LaboratoryStudy(progress, length=length)
     return {name: partial(study, ingredients) for name, study in NUMERICAL.items()} | {
         name: partial(study, laboratory) for name, study in LABORATORY.items()
     }

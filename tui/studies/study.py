@@ -69,7 +69,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
+class StudyCurve:
     """A line that is shown and not judged, `style` as matplotlib takes it."""
 
     label: str
@@ -86,7 +86,7 @@ class Panel:
     x_label: str
     y_label: str
     series: tuple[Series, ...] = ()
-    curves: tuple[Curve, ...] = ()
+    curves: tuple[StudyCurve, ...] = ()
     log: Literal["", "x", "y", "xy"] = ""
 
 

@@ -45,7 +45,7 @@ from tui.runs.estimate_settings import settings_for
 from tui.service.status import status_lines
 from tui.web.chart import choice_of, drawn, with_models
 from tui.web.html import instant, page
-from tui.web.traces import Trace, traces
+from tui.web.traces import WebTrace, traces
 from tui.wording.facts import RANK_TONES
 
 _LOGGER = logging.getLogger(__name__)
@@ -275,7 +275,7 @@ class _Page:
     def __init__(self, live: Live, state: State, bench: Bench | None) -> None:
         self._live, self.state, self._bench = live, state, bench
         self._recent = RecentMotion()
-        self._traces: tuple[Trace, ...] = ()
+        self._traces: tuple[WebTrace, ...] = ()
         self._drawn: Result | None = None
         self._next_note = 0.0
         self._of_estimate = dict.fromkeys(("verdict", "noise", "clocks"), "")

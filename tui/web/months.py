@@ -10,7 +10,7 @@ from daq.archive.store import Store
 from tui.output.archive.tables import course_table, course_title, remarks
 from tui.output.results import averages_line, result_table, result_title
 from tui.service.history.ledger import noise_of
-from tui.service.history.series import Series, history
+from tui.service.history.series import NoiseSeries, history
 from tui.service.history.shown import history_figure, history_lines, history_table
 from tui.service.records.store import RunStore
 from tui.web.work import check_wanted
@@ -55,7 +55,7 @@ class Months:
             "everywhere_lines": list(history_lines(everywhere)),
         }
 
-    def _series(self) -> list[Series]:
+    def _series(self) -> list[NoiseSeries]:
         return history(RunStore(self._bench.recording_directory).noise(self._bench.name))
 
     def sensors_picture(self) -> bytes:

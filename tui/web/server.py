@@ -42,7 +42,7 @@ from estimator.decision.verdict import Verdict
 from estimator.errors import EstimatorError
 from tui.application.plan import TestPlan
 from tui.application.test_view.units import units_of
-from tui.certificate.ledger import Entry, LedgerError
+from tui.certificate.ledger import LedgerEntry, LedgerError
 from tui.output.json_values import json_text
 from tui.output.results import averages_line, curves_csv
 from tui.service.records.places import file_name
@@ -64,7 +64,7 @@ from tui.web.html import page
 from tui.web.live import Live
 from tui.web.months import Months
 from tui.web.pages import about_test, how_sensors_stand
-from tui.web.signal import Look, Opened, drawn, steps
+from tui.web.signal import Opened, SignalLook, drawn, steps
 from tui.web.tests import PAGE, NoSuchTestError, Tests, compared, content_of, exclude_of
 from tui.web.work import TooMuchWorkError, Work
 from tui.wording.verdict_text import WORDS
@@ -115,7 +115,7 @@ class _LaterError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class WebPlace:
     """Where the server is reached."""
 
     address: str
@@ -142,10 +142,10 @@ class Guard:
     ----------
     app : ASGI application
     access : Access
-    place : Place
+    place : WebPlace
     """
 
-    def __init__(self, app: ASGIApp, access: Access, place: Place) -> None:
+    def __init__(self, app: ASGIApp, access: Access, place: WebPlace) -> None:
         self._app, self._access, self._place = app, access, place
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -284,7 +284,7 @@ class Server:
         with listening:
             names = {*_LOOPBACK, *(name.lower() for name in (*web.hosts, socket.gethostname()))}
             is_secure = web.certificate is not None
-            place = Place(web.address, listening.getsockname()[1], is_secure, frozenset(names))
+            place = WebPlace(web.address, listening.getsockname()[1], is_secure, frozenset(names))
             config = uvicorn.Config(
                 self.application(place),
                 loop="asyncio",
@@ -336,7 +336,7 @@ class Server:
             ("/mark", steer, self._mark, "POST"),
         )
 
-    def application(self, place: Place) -> ASGIApp:
+    def application(self, place: WebPlace) -> ASGIApp:
         """Return the application that answers requests."""
         self._place = place
         routes = [
@@ -574,7 +574,7 @@ class Server:
             query="?" * bool(chosen) + urlencode([("exclude", each) for each in chosen]),
         )
 
-    def _certificates(self, state: State) -> tuple[list[tuple[Entry, Path]], str]:
+    def _certificates(self, state: State) -> tuple[list[tuple[LedgerEntry, Path]], str]:
         """Return the certificates of a test, or why there are none to be trusted."""
         try:
             return self._tests.certificates(state), ""
@@ -599,7 +599,7 @@ class Server:
         key = await run_in_threadpool(self._tests.key_of, request.path_params["name"])
         act = partial(Opened.of, key[0])
         opened = await self._made(request, self._tests.work, ("signal", key), act, PATIENCE)
-        look = Look.of(opened, asked)
+        look = SignalLook.of(opened, asked)
         snapshot = None
         if look.spectrum or look.exclude or look.is_changed or opened.settings.reject:
             name, chosen = request.path_params["name"], look.exclude if look.is_changed else None

@@ -76,7 +76,7 @@ class Opened:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SignalLook:
     """What a request asks to see.
 
     Attributes
@@ -100,7 +100,7 @@ class Look:
     is_changed: bool
 
     @classmethod
-    def of(cls, opened: Opened, asked: QueryParams) -> Look:
+    def of(cls, opened: Opened, asked: QueryParams) -> SignalLook:
         """Return what is asked for.
 
         Raises
@@ -164,7 +164,7 @@ def _stretch(text: str, near: float, whole: tuple[float, float]) -> str:
     return stretch_text(begin, end if end > begin else end + DAY)
 
 
-def drawn(opened: Opened, look: Look, snapshot: Snapshot | None) -> dict[str, Any]:
+def drawn(opened: Opened, look: SignalLook, snapshot: Snapshot | None) -> dict[str, Any]:
     """Return what the page shows of a look. Blocks."""
     with opened.lock:
         signal = opened.signal
@@ -209,7 +209,7 @@ def drawn(opened: Opened, look: Look, snapshot: Snapshot | None) -> dict[str, An
     }
 
 
-def steps(look: Look, whole: tuple[float, float]) -> list[tuple[str, str]]:
+def steps(look: SignalLook, whole: tuple[float, float]) -> list[tuple[str, str]]:
     """Return what leads on from a look without a script: names and addresses."""
     span = look.span
     found = {

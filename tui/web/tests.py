@@ -20,7 +20,7 @@ from daq.recording.storage.locking import is_being_written
 from daq.results.result import Result
 from tui.application.controls import Controls
 from tui.application.state import Reference, State
-from tui.certificate.ledger import Entry as Certificate
+from tui.certificate.ledger import LedgerEntry as Certificate
 from tui.certificate.ledger import ledger_of
 from tui.output.json_document import document
 from tui.runs.catalogue import Entry, catalogue
@@ -41,7 +41,7 @@ class NoSuchTestError(HuddleError):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundTests:
     """A page of the list of tests: its entries, and how many there are in all."""
 
     entries: tuple[Entry, ...]
@@ -79,7 +79,7 @@ class Tests:
         self.work.close()
         self.reading.close()
 
-    def listed(self, *, text: str = "", verdict: str = "", first: int = 0) -> Found:
+    def listed(self, *, text: str = "", verdict: str = "", first: int = 0) -> FoundTests:
         """Return tests, the newest first, whose name, bench or operator has a text. Blocks.
 
         Parameters
@@ -102,7 +102,7 @@ class Tests:
             if wanted in f"{each.path.stem}\n{each.bench}\n{each.operator}".lower()
             and verdict in {"", each.verdict or "none"}
         ]
-        return Found(tuple(found[first : first + PAGE]), len(found))
+        return FoundTests(tuple(found[first : first + PAGE]), len(found))
 
     def path_of(self, name: str) -> Path:
         """Return the recording of a name that a request gives.

@@ -23,7 +23,7 @@ HEIGHT = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Trace:
+class WebTrace:
     """The last samples of a channel.
 
     Attributes
@@ -41,7 +41,7 @@ class Trace:
     size: str
 
 
-def traces(recording: Recording) -> tuple[Trace, ...]:
+def traces(recording: Recording) -> tuple[WebTrace, ...]:
     """Return the traces of all channels that are estimated."""
     found = []
     for sensor in recording.sensors:
@@ -66,7 +66,7 @@ def traces(recording: Recording) -> tuple[Trace, ...]:
             size = int(most[column] - least[column]) / abs(channel.sensitivity)
             (text,), unit = readings([size], channel.unit)
             found.append(
-                Trace(
+                WebTrace(
                     f"{sensor.name}.{channel.name}",
                     " ".join(points[:, column].tolist()),
                     f"{text} {unit}",

@@ -45,7 +45,7 @@ def check_wanted(*_: object) -> None:
         check()
 
 
-class Piece:
+class WorkPiece:
     """Work, its result, how many wait for it, and until when others may come again."""
 
     def __init__(self, act: Callable[[], Any], visitor: str, key: Hashable) -> None:
@@ -59,12 +59,12 @@ class Work:
 
     def __init__(self, name: str, *, now: Callable[[], float] = time.monotonic) -> None:
         self._name, self._now = name, now
-        self._queues: OrderedDict[str, deque[Piece]] = OrderedDict()
-        self._known: OrderedDict[Hashable, Piece] = OrderedDict()
+        self._queues: OrderedDict[str, deque[WorkPiece]] = OrderedDict()
+        self._known: OrderedDict[Hashable, WorkPiece] = OrderedDict()
         self._changed = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def ask(self, visitor: str, key: Hashable, act: Callable[[], Any]) -> Piece:
+    def ask(self, visitor: str, key: Hashable, act: Callable[[], Any]) -> WorkPiece:
         """Return work, begun later unless it is known; `leave` gives it back.
 
         Parameters
@@ -91,7 +91,7 @@ class Work:
                     raise TooMuchWorkError(
                         f"{WAITING} pages wait to be made for you; try again in a moment"
                     )
-                piece = Piece(act, visitor, key)
+                piece = WorkPiece(act, visitor, key)
                 queue.append(piece)
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
@@ -105,7 +105,7 @@ class Work:
                     del self._known[known]
             return piece
 
-    def leave(self, piece: Piece, *, lease: float = 0.0) -> None:
+    def leave(self, piece: WorkPiece, *, lease: float = 0.0) -> None:
         """Drop work that nobody waits for any more; `lease`: seconds for which it is kept on."""
         with self._changed:
             piece.n_waiting -= 1
@@ -116,15 +116,15 @@ class Work:
                 if not queue:
                     del self._queues[piece.visitor]
 
-    def _is_wanted(self, piece: Piece) -> bool:
+    def _is_wanted(self, piece: WorkPiece) -> bool:
         return piece.n_waiting > 0 or piece.until > self._now()
 
-    def _drop(self, piece: Piece, queue: deque[Piece]) -> None:
+    def _drop(self, piece: WorkPiece, queue: deque[WorkPiece]) -> None:
         queue.remove(piece)
         piece.future.cancel()
         self._known.pop(piece.key, None)
 
-    def _check(self, piece: Piece) -> None:
+    def _check(self, piece: WorkPiece) -> None:
         with self._changed:  # who asks from now on has it begun again
             if not self._is_wanted(piece):
                 self._known.pop(piece.key, None)
@@ -138,7 +138,7 @@ class Work:
                     piece.future.cancel()
             self._queues.clear()
 
-    def _next(self) -> Piece | None:
+    def _next(self) -> WorkPiece | None:
         """Return the next piece, of the visitor who has waited longest; None ends the thread."""
         with self._changed:
             if not self._queues:

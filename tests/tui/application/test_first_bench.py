@@ -30,7 +30,7 @@ from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.application.bench_view.sensors import tapped
 from tui.application.first_bench import FirstBenchApp, FirstBenchScreen, NetworkForm
-from tui.commands.tui_controls import BenchControls, FirstBenchControls
+from tui.commands.tui_controls import BenchControls, ComputerControls
 from tui.runs.first_bench import draft
 from tui.simulation.devices import simulated
 
@@ -274,7 +274,7 @@ async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
 
     with simulated(parse(text), speed=8.0) as reachable:
         ports = [sensor.port for sensor in reachable.sensors]
-        first = FirstBenchApp(FirstBenchControls(path, ports, draft(path)))
+        first = FirstBenchApp(ComputerControls(path, ports, draft(path)))
         async with first.run_test(size=SIZES["small"]) as pilot:
             await until(pilot, lambda: screen_text(first).count("● live") == 3)
             for size in reversed(SIZES.values()):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.waiting import limit
-from tui.certificate.ledger import NAME, Entry, Ledger, LedgerError
+from tui.certificate.ledger import NAME, Ledger, LedgerEntry, LedgerError
 
 AT = datetime(2026, 11, 25, 12, tzinfo=UTC)
 
@@ -42,7 +42,7 @@ for number in range(int(count)):
 """
 
 
-def issue(ledger: Ledger, run: str, *, reason: str = "", prefix: str = "LAB") -> Entry:
+def issue(ledger: Ledger, run: str, *, reason: str = "", prefix: str = "LAB") -> LedgerEntry:
     with ledger.held():
         entry = ledger.allot(
             prefix, at=AT, by="Ada", recordings=[(f"{run}.h5", run, "0" * 64)],

@@ -19,7 +19,7 @@ from tests.tui.service.bench_files import START
 from tui.commands.main import app
 from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_table, label_lines
-from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.store import RunStore
 
 
@@ -147,7 +147,7 @@ def test_a_second_change_is_found_after_the_first() -> None:
     assert found[1].shift == pytest.approx(-4 * DECIBEL)
 
 
-def noise_of(runs: list[Run]) -> list[tuple[str, datetime, BandNoise, bool]]:
+def noise_of(runs: list[Run]) -> list[tuple[str, datetime, RecordedNoise, bool]]:
     return [(run.bench, run.due, noise, run.simulated) for run in runs for noise in run.noise]
 
 
@@ -155,7 +155,7 @@ def run_with(
     day: int, db: float, *, bench: str = "lab", sensor: str = "a", low: float = 0.95
 ) -> Run:
     psd = 1e-12 * 10 ** (db / 10)
-    noise = BandNoise(
+    noise = RecordedNoise(
         *(sensor, "M", "S1", "x", "m/s²", "three-sensor", 1.0, 10.0, psd, low * psd, psd / 0.95)
     )
     run = Run(bench, "night", START + timedelta(days=day), 60.0).to(RunState.RECORDING)

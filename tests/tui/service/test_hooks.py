@@ -16,11 +16,11 @@ from daq.bench.tables.unattended import Hooks
 from tests.tui.service.bench_files import HOURLY, START, Place, VirtualClock
 from tests.waiting import limit
 from tui.service.hooks import HookRunner, events_of, run_hook
-from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.store import RunStore
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell")
-NOISE = BandNoise(
+NOISE = RecordedNoise(
     "a", "M", "S1", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 9e-13, float("nan")
 )
 

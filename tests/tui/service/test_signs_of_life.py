@@ -25,7 +25,7 @@ from tui.output.logs.lines import JournalHandler, fields_of
 from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
-from tui.service.records.run_state import BandNoise
+from tui.service.records.run_state import RecordedNoise
 from tui.service.window import STALL
 
 ROOT = Path(__file__).parents[3]
@@ -89,7 +89,7 @@ async def test_metrics_show_runs_sensors_and_disk(
     metrics = ServiceMetrics(service, hook_runner)
     task = asyncio.create_task(service.run())
     await asyncio.sleep(2 * 3600.0)  # 14:00:30
-    noise = BandNoise("a", "", "7", "X", "m/s²", "three-sensor", 1.0, 10.0, 4e-12, 3e-12, 5e-12)
+    noise = RecordedNoise("a", "", "7", "X", "m/s²", "three-sensor", 1.0, 10.0, 4e-12, 3e-12, 5e-12)
     for run in place.changes:
         metrics.note(replace(run, noise=(noise,), verdict="not-decided", simulated=True))
     with metrics.served(Metrics(port=0)) as port:

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 from tests.tui.service.bench_files import HOURLY, START, Place
 from tui.commands.main import app
 from tui.commands.runs import PAGE
-from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.store import RunStore
 
-NOISE = BandNoise("A", "M", "7", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 5e-13, 2e-12)
+NOISE = RecordedNoise("A", "M", "7", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 5e-13, 2e-12)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from daq.devices.bench_file import load
 from tests.tui.web.conftest import SIZES, opened
 from tests.tui.web.pages import Server, bench_file, serving
 from tui.commands.main import app
-from tui.service.records.run_state import BandNoise, Run, RunState
+from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.store import RunStore
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def server(folder: Path) -> Iterator[Server]:
     store = RunStore(folder / "recordings")
     for day in range(40):
         psd = 1e-9 * (1.0 if day < 20 else 2.0)
-        noise = BandNoise.of(
+        noise = RecordedNoise.of(
             NAME, "M-1", "SN-7", "X", "m/s²", "three-sensor", 1.0, 10.0, psd, 0.95 * psd, 1.05 * psd
         )
         run = Run(

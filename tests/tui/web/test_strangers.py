@@ -32,7 +32,7 @@ from tui.web.access import Right, token_hash
 from tui.web.connections import HEAD, OF_ADDRESS, Connections
 from tui.web.server import Server as Pages
 from tui.web.tests import Tests
-from tui.web.work import WAITING, LeftError, Piece, TooMuchWorkError, Work, check_wanted
+from tui.web.work import WAITING, LeftError, TooMuchWorkError, Work, WorkPiece, check_wanted
 
 resource = pytest.importorskip("resource", reason="limits of descriptors")
 OPEN = {"/login"}
@@ -456,7 +456,7 @@ class Busy:
         self.work, self.go = Work("test"), threading.Event()
         self.done: list[str] = []
 
-    def ask(self, visitor: str, key: str) -> Piece:
+    def ask(self, visitor: str, key: str) -> WorkPiece:
         """Ask for work that notes its key."""
 
         def act() -> str:

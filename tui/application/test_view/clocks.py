@@ -19,7 +19,7 @@ from daq.results.clock_effect import (
 )
 from daq.results.result import Result
 from daq.results.vocabulary import clock_source
-from tui.application.test_view.curves import Line
+from tui.application.test_view.curves import DrawnLine
 from tui.page.table import Cell, Table
 
 COLOURS = ("#4cc9f0", "#f4a261", "#c297ff", "#e9d86b", "#7bd88f", "#ff7b9c", "#9aa5b8")
@@ -109,7 +109,7 @@ def drift_title(snapshot: Snapshot) -> str:
     return f"clock drift: lag behind {behind}, less constant rates"
 
 
-def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]:
+def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[DrawnLine]:
     """Return each clock's lag over time, a straight line taken out; the chosen sensor's on top.
 
     Minutes and microseconds; at most one point per column.
@@ -124,7 +124,7 @@ def drift_lines(snapshot: Snapshot, *, chosen: str, n_points: int) -> list[Line]
         lag = drift[:, 1 + number]
         straight = np.polynomial.Polynomial.fit(drift[:, 0], lag, 1)
         left = (lag - straight(drift[:, 0]))[::step] * 1e6
-        lines.append(Line(clock.sensor, _colour(number), minutes, left))
+        lines.append(DrawnLine(clock.sensor, _colour(number), minutes, left))
     return sorted(lines, key=lambda line: line.label == chosen)
 
 

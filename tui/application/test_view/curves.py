@@ -65,7 +65,7 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class DrawnLine:
     """One line of a plot that is straight both ways; shape (n_points,)."""
 
     label: str

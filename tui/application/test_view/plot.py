@@ -13,7 +13,7 @@ from textual_plot import HiResMode, LegendLocation, PlotWidget
 from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.test_view.braille import cells, joined
-from tui.application.test_view.curves import Curve, Line, level_limits
+from tui.application.test_view.curves import Curve, DrawnLine, level_limits
 from tui.application.test_view.units import SpectrumUnit
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ class DriftPlot(FullPlot):
     def __init__(self, *, id: str | None = None) -> None:  # noqa: A002 - Textual's name
         super().__init__(TimeAxis(), LagAxis(), id=id)
 
-    def show(self, lines: Sequence[Line]) -> None:
+    def show(self, lines: Sequence[DrawnLine]) -> None:
         """Draw these lines and no others; the last one on top."""
         self.clear()
         if not lines:

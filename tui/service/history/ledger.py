@@ -23,7 +23,7 @@ from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.results.band_summary import CONSTANT, known_range
 from estimator.errors import BandError
-from tui.service.records.run_state import BandNoise, utc_text
+from tui.service.records.run_state import RecordedNoise, utc_text
 from tui.wording.formatting import drift_line
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def band_noise(
     bands: Iterable[tuple[float, float]],
     about: Mapping[str, tuple[str, str]],
     notes: list[str],
-) -> tuple[BandNoise, ...]:
+) -> tuple[RecordedNoise, ...]:
     """Return the noise of every channel in the band of a test, and in others.
 
     To be compared with other tests of the sensors: without what is known of their sensitivities.
@@ -176,7 +176,7 @@ def band_noise(
             values = (float(each.estimate[0]), float(each.low[0]), float(each.high[0]))
             model, serial_number = about.get(label.sensor, ("", ""))
             own = (label.sensor, model, serial_number, label.channel, label.unit)
-            found.append(BandNoise(*own, method, float(band[0]), float(band[1]), *values))
+            found.append(RecordedNoise(*own, method, float(band[0]), float(band[1]), *values))
     return tuple(found)
 
 
@@ -236,7 +236,7 @@ def _sensor_row(run_id: str, each: SensorRecord, verdict: TestVerdict | None) ->
     return (*own, json.dumps(sensitivities), json.dumps(limits), each.firmware)
 
 
-def _values(noise: BandNoise) -> tuple[Any, ...]:
+def _values(noise: RecordedNoise) -> tuple[Any, ...]:
     return tuple(getattr(noise, name) for name in _NOISE.split(", "))
 
 
@@ -321,7 +321,7 @@ def noise_of(serial_number: str) -> list[Found]:
     rows = _rows(_OF_SENSOR, serial_number)
     is_simulated = all(row[2] for row in rows)
     return [
-        (bench, datetime.fromtimestamp(started, UTC), BandNoise.of(*values), is_simulated)
+        (bench, datetime.fromtimestamp(started, UTC), RecordedNoise.of(*values), is_simulated)
         for bench, started, simulated, *values in rows
         if bool(simulated) is is_simulated
     ]

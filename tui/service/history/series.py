@@ -10,9 +10,9 @@ from functools import lru_cache
 from typing import Any
 
 from daq.results.change_test import DECIBEL, NORMAL_95, Change, changes
-from tui.service.records.run_state import BandNoise, utc_text
+from tui.service.records.run_state import RecordedNoise, utc_text
 
-Found = tuple[str, datetime, BandNoise, bool]
+Found = tuple[str, datetime, RecordedNoise, bool]
 """Name of the bench, time at which the run was due, the noise that the run found, and whether
 a sensor was simulated."""
 
@@ -22,12 +22,12 @@ FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class NoiseSeries:
     """One channel of one sensor in one band.
 
     Attributes
     ----------
-    noise : tuple of BandNoise
+    noise : tuple of RecordedNoise
         By time; the last says what the channel is called now.
     runs : tuple of (str, datetime)
         Bench and due time of the run of each.
@@ -39,14 +39,14 @@ class Series:
         Whether a sensor was simulated: such runs are compared with their like only.
     """
 
-    noise: tuple[BandNoise, ...]
+    noise: tuple[RecordedNoise, ...]
     runs: tuple[tuple[str, datetime], ...]
     changes: tuple[Change, ...]
     usable: tuple[int, ...]
     simulated: bool = False
 
     @property
-    def last(self) -> BandNoise:
+    def last(self) -> RecordedNoise:
         """The latest noise."""
         return self.noise[-1]
 
@@ -107,12 +107,12 @@ def history(
     band: tuple[float, float] | None = None,
     scatter: float = SCATTER,
     false_alarms: float = FALSE_ALARMS,
-) -> list[Series]:
+) -> list[NoiseSeries]:
     """Return the history of every channel, and where its noise has changed.
 
     Parameters
     ----------
-    found : iterable of (str, datetime, BandNoise, bool)
+    found : iterable of (str, datetime, RecordedNoise, bool)
         Bench, due time and noise of runs, of any benches, and whether they were simulated.
     band : (float, float), optional
         In Hz; all bands that were kept, if not given.
@@ -138,7 +138,7 @@ def bands_of(found: Iterable[Found]) -> list[tuple[float, float]]:
     return sorted({_rounded(noise.low_hz, noise.high_hz) for _, _, noise, _ in found})
 
 
-def _key(bench: str, noise: BandNoise) -> tuple[object, ...]:
+def _key(bench: str, noise: RecordedNoise) -> tuple[object, ...]:
     sensor = noise.serial_number or f"{bench}/{noise.sensor}"
     band = _rounded(noise.low_hz, noise.high_hz)
     return (sensor, noise.channel, noise.unit, noise.method, band)
@@ -149,24 +149,24 @@ def _rounded(low_hz: float, high_hz: float) -> tuple[float, float]:
     return float(f"{low_hz:.3g}"), float(f"{high_hz:.3g}")
 
 
-def _same_band(noise: BandNoise, band: tuple[float, float]) -> bool:
+def _same_band(noise: RecordedNoise, band: tuple[float, float]) -> bool:
     return all(
         math.isclose(own, wanted, rel_tol=0.01)
         for own, wanted in zip((noise.low_hz, noise.high_hz), band, strict=True)
     )
 
 
-def _series(found: Sequence[Found], scatter: float, false_alarms: float) -> Series:
+def _series(found: Sequence[Found], scatter: float, false_alarms: float) -> NoiseSeries:
     runs, noise = tuple(each[:2] for each in found), tuple(each[2] for each in found)
     usable = tuple(n for n, each in enumerate(noise) if 0 < each.low <= each.psd <= each.high)
     levels = [math.log(noise[n].psd) for n in usable]
     # A standard deviation of zero would be beyond any measurement.
     deviations = [max(1e-6, math.hypot(_deviation(noise[n]), scatter)) for n in usable]
     found_changes = tuple(changes(levels, deviations, false_alarms=false_alarms))
-    return Series(noise, runs, found_changes, usable, simulated=found[0][3])
+    return NoiseSeries(noise, runs, found_changes, usable, simulated=found[0][3])
 
 
-def _deviation(noise: BandNoise) -> float:
+def _deviation(noise: RecordedNoise) -> float:
     """Return the standard deviation of the logarithm: of the wider side of the interval."""
     wider = max(noise.high / noise.psd, noise.psd / noise.low)
     return math.log(wider) / NORMAL_95

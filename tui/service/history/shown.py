@@ -9,8 +9,8 @@ from xml.sax.saxutils import escape
 from daq.bench.units import decibels
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.page.table import Table
-from tui.service.history.series import FALSE_ALARMS, SCATTER, Series
-from tui.service.records.run_state import BandNoise, utc_text
+from tui.service.history.series import FALSE_ALARMS, SCATTER, NoiseSeries
+from tui.service.records.run_state import RecordedNoise, utc_text
 from tui.wording.formatting import level_with_error
 
 if TYPE_CHECKING:
@@ -28,13 +28,13 @@ LINE = 3.6
 """Millimetres from one line to the next."""
 
 
-def history_figure(found: Sequence[Series]) -> Figure:
+def history_figure(found: Sequence[NoiseSeries]) -> Figure:
     """Return a picture with a panel for each sensor and band, and lines where noise has changed."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
 
     from tui.page.drawing import look  # noqa: PLC0415
 
-    panels: dict[tuple[str, float, float, str], list[Series]] = {}
+    panels: dict[tuple[str, float, float, str], list[NoiseSeries]] = {}
     for series in found:
         last = series.last
         panels.setdefault((series.sensor, last.low_hz, last.high_hz, last.unit), []).append(series)
@@ -73,7 +73,7 @@ def history_figure(found: Sequence[Series]) -> Figure:
         return figure
 
 
-def history_table(found: Sequence[Series]) -> Table:
+def history_table(found: Sequence[NoiseSeries]) -> Table:
     """Return a row for each channel and band: its first and last noise, and its changes."""
     words = ("serial number", "sensor", "channel", "band (Hz)", "unit²/Hz of")
     numbers = ("runs", "first (dB)", "last (dB)")
@@ -105,7 +105,7 @@ def tests_table(tests: Sequence[SensorTest]) -> Table:
     return Table.of(names, rows, right=("°C",))
 
 
-def label_lines(found: Sequence[Series]) -> list[str]:
+def label_lines(found: Sequence[NoiseSeries]) -> list[str]:
     """Return what a label says of a sensor: model, last test, and noise in its widest band."""
     if not found:
         return []
@@ -155,11 +155,11 @@ def label_svg(serial_number: str, lines: Sequence[str]) -> str:
     )
 
 
-def _level(noise: BandNoise) -> str:
+def _level(noise: RecordedNoise) -> str:
     return level_with_error(noise.psd, noise.high, noise.low)
 
 
-def change_lines(series: Series) -> Iterator[str]:
+def change_lines(series: NoiseSeries) -> Iterator[str]:
     """Yield a sentence for each change of a channel."""
     for change in series.changes:
         first, found = series.due_of(change.first), series.due_of(change.found)
@@ -173,7 +173,7 @@ def change_lines(series: Series) -> Iterator[str]:
 
 
 def history_lines(
-    found: Sequence[Series], *, scatter: float = SCATTER, false_alarms: float = FALSE_ALARMS
+    found: Sequence[NoiseSeries], *, scatter: float = SCATTER, false_alarms: float = FALSE_ALARMS
 ) -> Iterator[str]:
     """Yield a sentence for each change of each channel, and what was tested."""
     n_changed = 0

@@ -40,7 +40,7 @@ from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
 from tui.service.history.ledger import band_noise, noted
 from tui.service.records.parts import with_continuations
-from tui.service.records.run_state import RUN, BandNoise
+from tui.service.records.run_state import RUN, RecordedNoise
 
 MEMORY_SHARE = 0.6
 """Of the memory of the service that an estimate may take: the least of the computer's and of the
@@ -50,7 +50,7 @@ OOM_SCORE = 800
 _OF_DISK = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE),
 }
-_NOISE = tuple(field.name for field in fields(BandNoise))
+_NOISE = tuple(field.name for field in fields(RecordedNoise))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Outcome:
 
     verdict: str = ""
     notes: tuple[str, ...] = ()
-    noise: tuple[BandNoise, ...] = ()
+    noise: tuple[RecordedNoise, ...] = ()
     error: str = ""
     parts: tuple[str, ...] = ()
     refused: bool = False
@@ -115,7 +115,7 @@ class Outcome:
         try:
             found = json.loads(text)
             noise = tuple(
-                BandNoise.of(*(each[name] for name in _NOISE)) for each in found.pop("noise")
+                RecordedNoise.of(*(each[name] for name in _NOISE)) for each in found.pop("noise")
             )
             notes, parts = tuple(found.pop("notes")), tuple(found.pop("parts"))
             known = tuple((part, run, root) for part, run, root in found.pop("identities"))

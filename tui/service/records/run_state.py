@@ -61,7 +61,7 @@ class WrongStateError(HuddleError):
 
 
 @dataclass(frozen=True, slots=True)
-class BandNoise:
+class RecordedNoise:
     """Mean noise of one channel in one band, as one run found it; PSD in unit²/Hz.
 
     ``low`` and ``high`` bound the 95 % interval.
@@ -80,7 +80,7 @@ class BandNoise:
     high: float
 
     @classmethod
-    def of(cls, *values: Any) -> BandNoise:  # noqa: ANN401 - of the fields, in order
+    def of(cls, *values: Any) -> RecordedNoise:  # noqa: ANN401 - of the fields, in order
         """Return it from the fields in order; numbers that are None are not known."""
         numbers = (math.nan if value is None else float(value) for value in values[-3:])
         return cls(*values[:-3], *numbers)
@@ -140,7 +140,7 @@ class Run:
     removed: datetime | None = None
     pending_hooks: tuple[str, ...] = ()
     simulated: bool = False
-    noise: tuple[BandNoise, ...] = field(default=(), compare=False)
+    noise: tuple[RecordedNoise, ...] = field(default=(), compare=False)
 
     @property
     def key(self) -> str:
@@ -208,7 +208,7 @@ class Run:
             ended=None if started is None else started + timedelta(seconds=record["duration"]),
             parts=tuple(map(str, record["recordings"])),
             verdict=str(record["verdict"] or ""),
-            noise=tuple(BandNoise.of(*each.values()) for each in record["noise"]),
+            noise=tuple(RecordedNoise.of(*each.values()) for each in record["noise"]),
         )
 
     def document(self) -> dict[str, Any]:

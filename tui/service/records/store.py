@@ -24,7 +24,7 @@ from daq.whole_file import create_private, hidden, put_in_place, remove, replace
 from tui.service.records.run_state import (
     NEXT,
     UNFINISHED,
-    BandNoise,
+    RecordedNoise,
     Run,
     RunState,
     from_text,
@@ -67,7 +67,7 @@ _COLUMNS = (
     *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
 )
 # `untold` holds Run.pending_hooks: renamed, earlier versions could not open the database.
-_NOISE = tuple(field.name for field in fields(BandNoise))
+_NOISE = tuple(field.name for field in fields(RecordedNoise))
 _STATES = ", ".join(f"'{state}'" for state in RunState)
 _DATES = " OR ".join(
     f"({name} IS NOT NULL AND julianday({name}) IS NULL)"
@@ -238,7 +238,7 @@ class RunStore:
             f"SELECT {', '.join(_NOISE)} FROM noise WHERE run = ? ORDER BY rowid",  # noqa: S608
             run.key,
         )
-        return replace(run, noise=tuple(BandNoise.of(*row) for row in rows))
+        return replace(run, noise=tuple(RecordedNoise.of(*row) for row in rows))
 
     def begun(self, bench: str) -> set[str]:
         """Return the keys of all runs that are no longer due."""
@@ -257,7 +257,7 @@ class RunStore:
 
     def noise(
         self, bench: str | None = None, since: datetime | None = None
-    ) -> Iterator[tuple[str, datetime, BandNoise, bool]]:
+    ) -> Iterator[tuple[str, datetime, RecordedNoise, bool]]:
         """Yield the noise of all runs by their time: bench, due time, noise, whether simulated."""
         conditions, values = [], []
         if bench is not None:
@@ -279,7 +279,7 @@ class RunStore:
             moment = moments.get(due)
             if moment is None:
                 moment = moments[due] = datetime.fromisoformat(due)
-            yield name, moment, BandNoise.of(*values_of_row), bool(simulated)
+            yield name, moment, RecordedNoise.of(*values_of_row), bool(simulated)
 
     def _found(
         self,
