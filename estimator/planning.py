@@ -37,7 +37,7 @@ ROUNDING = 1e-24  # coherence that is zero within rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class TimePlan:
     """Requirements and results of one method.
 
     Attributes
@@ -131,7 +131,7 @@ def plan(
     dims: tuple[int, ...],
     settings: WelchSettings,
     cov: float,
-) -> list[Plan]:
+) -> list[TimePlan]:
     """Return the requirements of every method for a target coefficient of variation.
 
     Parameters
@@ -149,7 +149,7 @@ def plan(
 
     Returns
     -------
-    list of Plan
+    list of TimePlan
         One per method, in the order of `METHODS`, then the Cramér-Rao bound.
 
     Raises
@@ -210,7 +210,7 @@ def _plan_of_two(
     *,
     cov: float,
     change: float,
-) -> Plan:
+) -> TimePlan:
     """Return what two sensors need where the level of the motion has a deviation of so many dB."""
     noise = np.diag(noise_psd[0]).astype(np.complex128)
     level = ndtri((np.arange(PLANNED_PARTS) + 0.5) / PLANNED_PARTS)
@@ -296,14 +296,14 @@ def _plan(
     share: FloatArray,
     settings: WelchSettings,
     least: FloatArray | float = 0.0,
-) -> Plan:
+) -> TimePlan:
     """Return a plan from the averages for the precision and those to resolve the motion."""
     needed = np.maximum(averages, least)
     known = np.isfinite(needed)
     window = get_window(settings.window, settings.segment_length)
     segments = np.full(needed.shape, np.nan)
     segments[known] = [segments_needed(window, settings.hop, n) for n in needed[known]]
-    return Plan(
+    return TimePlan(
         method=method,
         n_effective=np.where(known, needed, np.nan),
         n_segments=segments,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.levels.interval import interval
-from estimator.likelihood.changing_motion import BandNoise, band_noise
+from estimator.likelihood.changing_motion import ChangingMotionNoise, band_noise
 
 N_PARTS = 12
 KINDS = {"two": (1, 2), "triaxial": (3, 2), "pair": (1, 3)}
@@ -127,7 +127,7 @@ def row(
     identified, accepted, held, error = [], [], [], []
     for _ in range(draws):
         at = scene(rng, kind, n_freqs, change, snr)
-        found: BandNoise = band_noise(
+        found: ChangingMotionNoise = band_noise(
             *(_drawn(rng, fault(rng, at), n), np.full(N_PARTS, float(n))),
             dims=(d,) * sensors,
             n_dims=d,

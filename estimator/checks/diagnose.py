@@ -52,7 +52,7 @@ from estimator.median import median_of_columns
 from estimator.records import dataclass
 from estimator.self_noise.coherency import (
     Coherency,
-    Presence,
+    PresentSensors,
     blocks,
     check_averages,
     check_dims,
@@ -412,7 +412,7 @@ def _without(shared: FloatArray, sensors: frozenset[int]) -> FloatArray:
 
 def _shared(
     canonical: CanonicalCoherence,
-    there: Presence,
+    there: PresentSensors,
     n_sensors: int,
     *,
     inside: BoolArray,
@@ -446,7 +446,7 @@ def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> F
 def _fit(
     part: Coherency,
     frequency: FloatArray,
-    there: Presence,
+    there: PresentSensors,
     q: int,
     *,
     n_effective: float,
@@ -470,7 +470,7 @@ def _fit(
 
 
 def _test(
-    fit: Maximum | Untested, there: Presence, n_effective: float, n_freqs: int
+    fit: Maximum | Untested, there: PresentSensors, n_effective: float, n_freqs: int
 ) -> tuple[ModelTest, Untested | None]:
     """Test the model at every frequency; return NaN and the reason if no test is possible.
 
@@ -497,7 +497,7 @@ def _responses(
     csm: ComplexArray,
     checked: Coherency,
     frequency: FloatArray,
-    there: Presence,
+    there: PresentSensors,
     *,
     vertical: int | None,
     coherence: CanonicalCoherence,

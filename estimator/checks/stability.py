@@ -25,7 +25,7 @@ from estimator.checks.steadiness import (
     MIN_DEGREES,
     MIN_PARTS,
     VALUES_AT_ONCE,
-    Levels,
+    PartLevels,
     Regression,
     ResponseChange,
     ResponseScores,
@@ -136,7 +136,7 @@ class Scatter:
         )
 
     @classmethod
-    def of(cls, levels: Sequence[Levels | None], n_channels: int) -> Scatter:
+    def of(cls, levels: Sequence[PartLevels | None], n_channels: int) -> Scatter:
         """Return the scatter of the levels of each band; NaN where there are none."""
         unknown = np.full(n_channels, np.nan)
         return cls(
@@ -447,8 +447,8 @@ class _Band:
     """What the parts show of one band; `levels` are None where they are too uncertain."""
 
     explained: _Explained
-    levels: Levels | None
-    of_runs: Levels | None
+    levels: PartLevels | None
+    of_runs: PartLevels | None
     scores: _Scores
     responses: ResponseScores
 
@@ -480,7 +480,7 @@ class _Band:
         """Return what some parts show of the noise."""
         if self.levels is None:
             return self
-        levels = Levels(self.levels.level[some], self.levels.degrees[some])
+        levels = PartLevels(self.levels.level[some], self.levels.degrees[some])
         return replace(self, levels=levels, scores=self.scores.of_parts(some))
 
 
@@ -530,7 +530,7 @@ def _band(
         if by_run:
             of_run = regression(parts.joined(some, by_run), at, psd[bins])
             of_runs.append(noise_levels(of_run, own))
-    whole = Levels.joined(levels)
+    whole = PartLevels.joined(levels)
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
     total = parts.averages.sum()
     # few averages of noise that changes look like a response, unless the motion is far stronger
@@ -548,7 +548,7 @@ def _band(
             left=total / len(groups) / q - 1,
         ),
         whole if known else None,
-        Levels.joined(of_runs) if of_runs and known else None,
+        PartLevels.joined(of_runs) if of_runs and known else None,
         scores,
         functools.reduce(operator.add, responses),
     )
@@ -823,7 +823,7 @@ class _Scores:
         found.score = self.score[some]
         return found
 
-    def inflation(self, levels: Levels) -> float:
+    def inflation(self, levels: PartLevels) -> float:
         """Return the variance of the scores of pairs over that for steady noise.
 
         Valid for any rate of change of the noise; 1 unless significantly more. Noise of level l_b

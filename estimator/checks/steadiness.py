@@ -138,7 +138,7 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Levels:
+class PartLevels:
     """Noise of parts as a fraction of the mean, over some frequencies.
 
     Attributes
@@ -152,7 +152,7 @@ class Levels:
     degrees: FloatArray
 
     @classmethod
-    def joined(cls, pieces: Sequence[Levels]) -> Levels:
+    def joined(cls, pieces: Sequence[PartLevels]) -> PartLevels:
         """Return the mean over pieces of a band, of as many frequencies each."""
         inverse = np.mean([1 / each.degrees for each in pieces], axis=0) / len(pieces)
         return cls(np.mean([each.level for each in pieces], axis=0), 1 / inverse)
@@ -178,11 +178,11 @@ class Levels:
         return np.asarray(np.sqrt(np.mean(1 / self.degrees, axis=0)))
 
 
-def noise_levels(found: Regression, correlation: FloatArray) -> Levels:
+def noise_levels(found: Regression, correlation: FloatArray) -> PartLevels:
     """Return the noise of every part; `correlation` of bins has the shape (n_bins, n_bins)."""
     root = np.sqrt(np.einsum("fpp->fp", found.inverse))
     variance = np.einsum("fp,fg,gp->p", root, correlation, root) / len(root) ** 2
-    return Levels(1 + found.noise.mean(axis=1), found.averages[:, None] / variance)
+    return PartLevels(1 + found.noise.mean(axis=1), found.averages[:, None] / variance)
 
 
 class ResponseScores:

@@ -72,7 +72,7 @@ _ZERO = 1e-9  # eigenvalue of scaled information that is none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BandNoise:
+class ChangingMotionNoise:
     """Noise of the channels in one band, from motion that changes.
 
     Attributes
@@ -417,7 +417,7 @@ def band_noise(
     shared: Sequence[tuple[int, int]] = (),
     alike: float = 1.0,
     steadiness: float = STEADINESS,
-) -> BandNoise:
+) -> ChangingMotionNoise:
     """Return the noise of sensors in one band from the parts of a recording.
 
     Parameters
@@ -439,7 +439,7 @@ def band_noise(
 
     Returns
     -------
-    BandNoise
+    ChangingMotionNoise
 
     Raises
     ------
@@ -550,7 +550,7 @@ def _estimate(
     unit: FloatArray,
     kept: BoolArray,
     steadiness: float,
-) -> BandNoise:
+) -> ChangingMotionNoise:
     q, diagonal = model.n_dims, model.diagonal
     n_freqs = len(parts.csm)
     contrasts, projector = _trusted(point)
@@ -605,7 +605,7 @@ def _estimate(
     noise = np.einsum("ii->i", point.noise).real
     square = np.maximum(deviation**2, own * noise**2)
     cumulants = np.stack([square, own * noise * square, own * square**2])
-    return BandNoise(
+    return ChangingMotionNoise(
         level=np.where(identified, level, np.nan) * power,
         cumulants=cumulants * power ** np.array([[2], [3], [4]]),
         lever=(lever + seems) * power,

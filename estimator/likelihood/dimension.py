@@ -19,11 +19,11 @@ from estimator.likelihood import goodness_of_fit
 from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, n_noise
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
-from estimator.likelihood.shared_by_two import SHARING, SharedByTwo, local_shares
+from estimator.likelihood.shared_by_two import SHARING, PairSearch, local_shares
 from estimator.median import median
 from estimator.records import Hertz, dataclass
 from estimator.self_noise.coherency import (
-    Presence,
+    PresentSensors,
     check_averages,
     check_dims,
     check_frequency,
@@ -223,7 +223,7 @@ def bands(frequency: FloatArray) -> IntArray:
     return blocks_of(frequency, least=MIN_BINS)
 
 
-def _check_enough(there: Presence, dims: tuple[int, ...], n_effective: float) -> None:
+def _check_enough(there: PresentSensors, dims: tuple[int, ...], n_effective: float) -> None:
     few = len(there.sensors) < 3  # so few averages make channels copies of each other
     needed = sum(dims) if few else len(there.channels)
     if n_effective <= needed:
@@ -349,7 +349,7 @@ def choose_dimension(
                     open_bands.remove(b)
         if not open_bands and q >= usual:
             break
-    sharers = SharedByTwo(
+    sharers = PairSearch(
         lambda q, b, group: search.sensor_test(q, b, group, r),
         search.local,
         dims=there.dims,

@@ -57,7 +57,7 @@ def _adjoint(matrices: ComplexArray) -> ComplexArray:
 
 
 @dataclass(slots=True)
-class Point:
+class FitPoint:
     """The likelihood at one N = V V* per frequency: q factors, and the matrix without them."""
 
     root: ComplexArray
@@ -66,11 +66,11 @@ class Point:
     eigenvectors: ComplexArray
     rest: ComplexArray
 
-    def take(self, index: IntArray | BoolArray | slice) -> Point:
+    def take(self, index: IntArray | BoolArray | slice) -> FitPoint:
         """Return the same for some frequencies only."""
-        return Point(*(getattr(self, each.name)[index] for each in fields(self)))
+        return FitPoint(*(getattr(self, each.name)[index] for each in fields(self)))
 
-    def put(self, index: IntArray | BoolArray, other: Point) -> None:
+    def put(self, index: IntArray | BoolArray, other: FitPoint) -> None:
         """Replace some frequencies."""
         for each in fields(self):
             getattr(self, each.name)[index] = getattr(other, each.name)
@@ -497,7 +497,7 @@ def _between(root: ComplexArray, matrix: ComplexArray, sensor: IntArray) -> Comp
 
 
 def _of_noise(
-    best: Point, final: ComplexArray, sensor: IntArray
+    best: FitPoint, final: ComplexArray, sensor: IntArray
 ) -> Iterator[tuple[str, FloatArray | ComplexArray]]:
     """Yield the noise and what is whitened by it, with the `final` root."""
     a, b = pairs(sensor)
@@ -514,7 +514,7 @@ def _of_noise(
 
 
 def scoring(
-    at: Point,
+    at: FitPoint,
     begin: ComplexArray,
     held: BoolArray,
     damping: FloatArray,
@@ -679,7 +679,7 @@ class _Given:
 
     def whitened(
         self, root: ComplexArray, guess: ComplexArray | None, q: int, rows: IntArray
-    ) -> Point:
+    ) -> FitPoint:
         """Whiten some matrices by N = V V*; `guess` has nearly the factors' directions."""
         if self._log_determinant is None:
             return self._diagonalised(root, q, rows)
@@ -693,13 +693,13 @@ class _Given:
         log_determinant = self._log_determinant[rows] - 2 * _log_determinant(root, self._sensor)
         taken = np.where(moving, w - np.log(np.where(moving, w, 1.0)) - 1, 0.0).sum(axis=1)
         white = white - (u * w[:, None, :]) @ _adjoint(u)
-        point = Point(root, trace - log_determinant - root.shape[1] - taken, w, u, white)
+        point = FitPoint(root, trace - log_determinant - root.shape[1] - taken, w, u, white)
         if not good.all():
             poor = np.flatnonzero(~good)
             point.put(poor, self._diagonalised(root[poor], q, rows[poor]))
         return point
 
-    def _diagonalised(self, root: ComplexArray, q: int, rows: IntArray) -> Point:
+    def _diagonalised(self, root: ComplexArray, q: int, rows: IntArray) -> FitPoint:
         """Diagonalise the inverse.
 
         In it the residual eigenvalues are the large ones, and so keep their precision for strong
@@ -712,7 +712,7 @@ class _Given:
         discrepancy = np.where(left, w - np.log(w) - 1, 0.0).sum(axis=1)
         free = u[:, :, q:]
         rest = (free * w[:, None, q:]) @ _adjoint(free)
-        return Point(root, discrepancy, w[:, :q], u[:, :, :q], rest)
+        return FitPoint(root, discrepancy, w[:, :q], u[:, :, :q], rest)
 
 
 def _rows(matrices: ComplexArray, rows: IntArray) -> ComplexArray:
@@ -763,14 +763,14 @@ def leading(
     return w[:, :q], u, good
 
 
-def _scaled(at: Point) -> Point:
+def _scaled(at: FitPoint) -> FitPoint:
     """Go to the best multiple of the noise, where the residual eigenvalues have a mean of one."""
     p, q = at.eigenvectors.shape[1:]
     total = np.einsum("fii->f", at.rest).real
     mean = total / (p - q)
     logs = total - (p - q) + _unused(at.eigenvalues) - at.discrepancy  # of the residual ones
     w = at.eigenvalues / mean[:, None]
-    return Point(
+    return FitPoint(
         at.root * np.sqrt(mean)[:, None, None],
         (p - q) * np.log(mean) - logs + _unused(w),
         w,

@@ -19,7 +19,7 @@ import numpy as np
 
 from estimator.levels.interval import CERTAIN, NORMAL_95, interval, unpredicted, worth
 from estimator.levels.pooled import blocks_of
-from estimator.likelihood.changing_motion import MOST, STEADINESS, BandNoise, band_noise
+from estimator.likelihood.changing_motion import MOST, STEADINESS, ChangingMotionNoise, band_noise
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
 from estimator.spectra.parts import Parts, grouped, joined_parts
@@ -65,7 +65,7 @@ class SharedPart:
     error: float
 
     @classmethod
-    def of(cls, found: BandNoise, pair: tuple[int, int], sensor: IntArray) -> SharedPart:
+    def of(cls, found: ChangingMotionNoise, pair: tuple[int, int], sensor: IntArray) -> SharedPart:
         """Return the largest among the channels of the sensors."""
         psd = np.sqrt(np.einsum("ii->i", found.noise).real)
         rows = np.ix_(sensor == pair[0], sensor == pair[1])
@@ -84,7 +84,7 @@ class PartBlock:
     low, high : float
         First and last frequency in Hz.
     refusal : tuple of Refusal or None, length n_channels
-    found : BandNoise or None
+    found : ChangingMotionNoise or None
         None where the recording is too short for parts.
     shared : tuple of SharedPart
         Of pairs of sensors whose noise may be shared, both with a level.
@@ -93,7 +93,7 @@ class PartBlock:
     low: float
     high: float
     refusal: tuple[Refusal | None, ...]
-    found: BandNoise | None
+    found: ChangingMotionNoise | None
     shared: tuple[SharedPart, ...] = ()
 
     @property
@@ -481,7 +481,7 @@ def _course(bound: FloatArray, total: float) -> FloatArray:
     return np.asarray(course / course.mean())
 
 
-def _refusals(found: BandNoise) -> tuple[Refusal | None, ...]:
+def _refusals(found: ChangingMotionNoise) -> tuple[Refusal | None, ...]:
     """Return why each channel has no level: it is not identified, or the model does not hold."""
     by_gain, by_noise = np.abs(found.follows).max(axis=1)
     cause = None

@@ -104,7 +104,7 @@ class Sharing:
         }
 
 
-class SharedByTwo:
+class PairSearch:
     """Search for sensors that share noise.
 
     Parameters

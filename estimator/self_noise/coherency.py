@@ -264,7 +264,7 @@ def inverse(matrices: ComplexArray) -> tuple[ComplexArray, BoolArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class Presence:
+class PresentSensors:
     """The live channels and sensors of a bench.
 
     Attributes
@@ -291,7 +291,7 @@ class Presence:
         return found
 
 
-def presence(given: Coherency, dims: tuple[int, ...]) -> Presence:
+def presence(given: Coherency, dims: tuple[int, ...]) -> PresentSensors:
     """Return the channels that are live at most frequencies.
 
     Parameters
@@ -303,7 +303,7 @@ def presence(given: Coherency, dims: tuple[int, ...]) -> Presence:
     absent = given.absent[given.valid].mean(axis=0) > 0.5
     sensor_of = np.repeat(np.arange(len(dims)), dims)
     count = np.bincount(sensor_of[~absent], minlength=len(dims))
-    return Presence(
+    return PresentSensors(
         channels=tuple(int(channel) for channel in np.flatnonzero(~absent)),
         sensors=tuple(int(sensor) for sensor in np.flatnonzero(count)),
         dims=tuple(int(n) for n in count if n),

@@ -5,7 +5,7 @@ are multiplied by one function of time: 0 in every gap of any sensor, 1 elsewher
 between. Common motion remains common with any window, and so is removed as before. After division
 by the energy of the window, the noise keeps its PSD if its spectrum is smooth. At frequencies with
 much lower noise than elsewhere, the side lobes of the window add noise from other frequencies:
-`Leakage` computes this bias.
+`WindowLeakage` computes this bias.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def without_trend(segment: FloatArray, weight: FloatArray, detrend: str) -> Floa
     return np.asarray(kept * weight[:, None])
 
 
-class Leakage:
+class WindowLeakage:
     """Leakage of noise from other frequencies by the windows of segments with gaps.
 
     Parameters

@@ -127,7 +127,7 @@ class Digitizer:
         return StatusBlock(self._system, stream, start_ns, text)
 
 
-class SerialPort(Endpoint):
+class GcfPort(Endpoint):
     """The digitizer's serial line; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, digitizer: Digitizer) -> None:
@@ -285,4 +285,4 @@ def create(device: DeviceSpec, source: Source) -> list[Line]:
         return [Line(server, "udp-server", scheme="udp"), recovery]
     if device.port == "tcp" and device.settings.get("link") == "scream":
         return [Line(ScreamServer(device, digitizer, sent, udp=False), "tcp")]
-    return [Line(SerialPort(device, digitizer), device.port)]
+    return [Line(GcfPort(device, digitizer), device.port)]

@@ -46,7 +46,13 @@ class Stream:
     """A buffer that is filled with scans and read in packets."""
 
     def __init__(
-        self, samples: Samples, columns: Columns, *, capacity: int, packet_size: int, now: float
+        self,
+        samples: Samples,
+        columns: InputColumns,
+        *,
+        capacity: int,
+        packet_size: int,
+        now: float,
     ) -> None:
         self._samples = samples
         self._columns = columns
@@ -140,7 +146,7 @@ class Stream:
 
 
 @dataclass(eq=False)
-class Columns:
+class InputColumns:
     """Values of the addresses of a scan list."""
 
     addresses: Sequence[int]
@@ -203,7 +209,7 @@ _WORDS = {
 _READ_ONLY = range(55000, 61810)
 
 
-class RefusedError(Exception):
+class RequestError(Exception):
     """The device replies with an exception; register 55000 gets the reason."""
 
     def __init__(self, exception: int, reason: int = 0) -> None:
@@ -274,7 +280,7 @@ class LabJack:
         function = adu.pdu[0] if adu.pdu else 0
         try:
             pdu = bytes((function,)) + self._function(function, adu.pdu, now)
-        except RefusedError as refused:
+        except RequestError as refused:
             self._store(reg.LAST_ERROR_DETAIL, struct.pack(">H", refused.reason))
             pdu = bytes((function | 0x80, refused.exception))
         except (RemoteProtocolError, struct.error):
@@ -285,7 +291,7 @@ class LabJack:
         if function in _READ:
             address, n_registers = struct.unpack(">HH", pdu[1:5])
             if not 1 <= n_registers <= 125:
-                raise RefusedError(3)
+                raise RequestError(3)
             values = self._read(address, n_registers, now)
             return bytes((len(values),)) + values
         if function == _WRITE_ONE:
@@ -294,7 +300,7 @@ class LabJack:
         if function == _WRITE_MANY:
             address, n_registers, size = struct.unpack_from(">HHB", pdu, 1)
             if size != 2 * n_registers or len(pdu) != 6 + size:
-                raise RefusedError(3)
+                raise RequestError(3)
             self._write(address, pdu[6:], now)
             return pdu[1:5]
         if function == reg.FEEDBACK:
@@ -305,7 +311,7 @@ class LabJack:
                 else:
                     self._write(command.address, command.values, now)
             return values
-        raise RefusedError(1)
+        raise RequestError(1)
 
     def _store(self, address: int, values: bytes) -> None:
         for k, word in enumerate(np.frombuffer(values, ">u2").tolist()):
@@ -337,7 +343,7 @@ class LabJack:
             return int(seconds * reg.SYSTEM_HZ).to_bytes(4, "big")[: 2 * n_registers]
         words = [self._memory.get(a) for a in range(address, address + n_registers)]
         if None in words:
-            raise RefusedError(reg.ILLEGAL_ADDRESS)
+            raise RequestError(reg.ILLEGAL_ADDRESS)
         return np.array(words, ">u2").tobytes()
 
     def _volts(self, address: int, now: float) -> bytes:
@@ -353,9 +359,9 @@ class LabJack:
 
     def _write(self, address: int, values: bytes, now: float) -> None:
         if len(values) % 2 or address in _READ_ONLY:
-            raise RefusedError(reg.ILLEGAL_ADDRESS)
+            raise RequestError(reg.ILLEGAL_ADDRESS)
         if any(address + k not in self._memory for k in range(len(values) // 2)):
-            raise RefusedError(reg.ILLEGAL_ADDRESS)
+            raise RequestError(reg.ILLEGAL_ADDRESS)
         if address == reg.STREAM_ENABLE:
             self._enable(int.from_bytes(values, "big"), now)
             return
@@ -363,7 +369,7 @@ class LabJack:
         if address == reg.STREAM_SCANRATE_HZ:
             wanted = self._real(address)
             if not 0.01 <= wanted <= MAX_SAMPLE_RATE:
-                raise RefusedError(3, 2608)
+                raise RequestError(3, 2608)
             if not self._is_t8:
                 self._store(address, struct.pack(">f", reg.actual_scan_rate(wanted)))
 
@@ -382,18 +388,18 @@ class LabJack:
     def _enable(self, value: int, now: float) -> None:
         if not value:
             if self.stream is None:
-                raise RefusedError(4, reg.STREAM_NOT_RUNNING)
+                raise RequestError(4, reg.STREAM_NOT_RUNNING)
             self.stop()
             return
         n_columns = self._value(reg.STREAM_NUM_ADDRESSES)
         if not 1 <= n_columns <= 128 or self.stream is not None:
-            raise RefusedError(4, 2605)
+            raise RequestError(4, 2605)
         addresses = [self._value(reg.STREAM_SCANLIST + 2 * k) for k in range(n_columns)]
         rate = self._rate_now(self._real(reg.STREAM_SCANRATE_HZ))
         overlap = rate * n_columns > MAX_SAMPLE_RATE
         as_is = overlap or rate == self._source.sampling_rate
         source = self._source if as_is else self._source.at_rate(rate)
-        columns = Columns(
+        columns = InputColumns(
             addresses,
             self._inputs,
             rate,
@@ -440,9 +446,9 @@ class LabJack:
 
     def _read_stream(self, n_registers: int, now: float) -> bytes:
         if self.stream is None:
-            raise RefusedError(4, reg.STREAM_NOT_RUNNING)
+            raise RequestError(4, reg.STREAM_NOT_RUNNING)
         if n_registers < 4:
-            raise RefusedError(3)
+            raise RequestError(3)
         self.stream.advance(now)
         packet = self.stream.take_out(n_registers - 4)
         return encode_response(packet, n_registers=n_registers)

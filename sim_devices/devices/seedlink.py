@@ -40,7 +40,7 @@ _INFO = (
 _NS = 1_000_000_000
 
 
-class Station:
+class SimulatedStation:
     """One station: its records in the order of sending."""
 
     def __init__(self, device: DeviceSpec, source: Source, sensor: str) -> None:
@@ -146,7 +146,7 @@ class SeedLinkServer(Endpoint):
     """The server; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
-        self._stations = [Station(device, source, sensor) for sensor in device.sensors]
+        self._stations = [SimulatedStation(device, source, sensor) for sensor in device.sensors]
         self._hello = HELLO if device.settings.get("offers_version_4", True) else HELLO[:24]
         path = device.settings.get("credentials")
         words = Path(path).expanduser().read_text(encoding="utf-8").split() if path else []
@@ -158,7 +158,7 @@ class SeedLinkServer(Endpoint):
         self._is_known = self._wanted is None
         self._received = b""
         self._version: Version = 3
-        self._chosen: Station | None = None
+        self._chosen: SimulatedStation | None = None
         self._selectors: dict[int, list[str]] = {}
         self._next: dict[int, int] = {}
         self._sends = False

@@ -55,13 +55,13 @@ from pydantic import Field, NonNegativeInt, ValidationError, model_validator
 from sim_devices.arrays import FloatArray
 from sim_devices.errors import ScenarioError
 from sim_devices.world.spectrum import Spectrum
-from sim_devices.world.tables import MAX_BLOCK, USABLE, MotionModel, SensorModel, Table
+from sim_devices.world.tables import MAX_BLOCK, USABLE, MotionModel, ScenarioTable, SensorModel
 
 OTHER_KEYS = frozenset({"speed", "clock", "devices", "faults"})
 """Keys of the `[simulation]` table that other modules read."""
 
 
-class Scenario(Table):
+class Scenario(ScenarioTable):
     """A motion and its sensors."""
 
     seed: NonNegativeInt = 0

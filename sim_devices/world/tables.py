@@ -25,13 +25,13 @@ MAX_BLOCK: Final = 65536
 """Grid samples computed at once by default: spectra are as wanted at the resolution of half."""
 
 
-class Table(BaseModel):
+class ScenarioTable(BaseModel):
     """Base of all tables: frozen, without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class TemperatureStep(Table):
+class TemperatureStep(ScenarioTable):
     """Exponential change of the rate by `ppm` from `time` (s) on, with `time_constant` (s)."""
 
     time: float
@@ -39,7 +39,7 @@ class TemperatureStep(Table):
     time_constant: NonNegativeFloat = 60.0
 
 
-class TemperatureRamp(Table):
+class TemperatureRamp(ScenarioTable):
     """Linear change of the rate by `ppm`, from `time` (s) on, within `duration` (s)."""
 
     time: float
@@ -47,14 +47,14 @@ class TemperatureRamp(Table):
     duration: PositiveFloat = 180.0
 
 
-class TemperatureCycle(Table):
+class TemperatureCycle(ScenarioTable):
     """Change of the rate by `ppm` times the sine of a cycle of `period` (s), from sample 0 on."""
 
     ppm: float
     period: PositiveFloat = 1200.0
 
 
-class SensorClock(Table):
+class SensorClock(ScenarioTable):
     """Clock of a sensor.
 
     Sample n is taken at world time `offset + n / (sampling_rate (1 + ppm 1e-6))` in s, plus the
@@ -70,7 +70,7 @@ class SensorClock(Table):
     cycle: TemperatureCycle | None = None
 
 
-class Response(Table):
+class SensorResponse(ScenarioTable):
     """Poles and zeros in rad/s as pairs [real, imaginary], of unit gain at `normalised_at` (Hz)."""
 
     poles: tuple[tuple[float, float], ...]
@@ -78,7 +78,7 @@ class Response(Table):
     normalised_at: PositiveFloat = 1.0
 
 
-class DeviceTemperature(Table):
+class DeviceTemperature(ScenarioTable):
     """Temperature in °C that a device states of itself.
 
     `mean` plus the sine of a cycle of `period` (s) with `amplitude`, plus `drift` (K/h). Neither
@@ -98,7 +98,7 @@ class DeviceTemperature(Table):
         return found
 
 
-class SensorModel(Table):
+class SensorModel(ScenarioTable):
     """One sensor: orientation, gain, delay, response, noise, clock and temperature.
 
     Channel r reads ``gain[r] · direction[r] · motion(t − delay, position) + noise[r]`` in m/s².
@@ -109,7 +109,7 @@ class SensorModel(Table):
     directions: tuple[tuple[float, ...], ...] | None = None
     gain: float | tuple[float, ...] = 1.0
     delay: float = 0.0
-    response: Response | None = None
+    response: SensorResponse | None = None
     noise: Spectrum | tuple[Spectrum, ...] = White(level=0.0)
     seed: NonNegativeInt | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -117,14 +117,14 @@ class SensorModel(Table):
     temperature: DeviceTemperature = DeviceTemperature()
 
 
-class ChangingLevel(Table):
+class ChangingLevel(ScenarioTable):
     """Level of the motion in dB: normal with this `deviation` every `period` in s, and linear."""
 
     deviation: NonNegativeFloat
     period: PositiveFloat = 60.0
 
 
-class CommonMotion(Table):
+class CommonMotion(ScenarioTable):
     """One motion for all sensors: independent components with these PSDs, then mixed.
 
     With `mixing` (one row per direction of the world, one column per spectrum) the directions are
@@ -154,7 +154,7 @@ class CommonMotion(Table):
         return self
 
 
-class PlaneWaves(Table):
+class PlaneWaves(ScenarioTable):
     """Rayleigh, Love and vertically arriving waves from all directions at one finite speed.
 
     `spectrum` is the PSD of each direction (x, y, z). A share `from_below` of it arrives

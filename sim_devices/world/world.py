@@ -27,8 +27,8 @@ from sim_devices.world.tables import (
     USABLE,
     ChangingLevel,
     PlaneWaves,
-    Response,
     SensorClock,
+    SensorResponse,
 )
 
 if TYPE_CHECKING:
@@ -411,7 +411,7 @@ def _whole_to(bandwidth: float, frequency: FloatArray) -> FloatArray:
     return np.asarray((1 + np.cos(np.pi * np.clip(beyond, 0, 1))) / 2)
 
 
-def _poles_and_zeros(response: Response, frequency: FloatArray) -> ComplexArray:
+def _poles_and_zeros(response: SensorResponse, frequency: FloatArray) -> ComplexArray:
     def raw(f: FloatArray) -> ComplexArray:
         s = 2j * np.pi * f[:, None]
         poles, zeros = (

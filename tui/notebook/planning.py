@@ -23,7 +23,7 @@ from estimator.levels.interval import worth
 from estimator.likelihood.dimension import MIN_DETERMINED_SENSORS, ROOM, ROOM_OF_ONE_CHANNEL
 from estimator.likelihood.gradients import MIN_SENSORS
 from estimator.methods import self_noise
-from estimator.planning import Plan
+from estimator.planning import TimePlan
 from estimator.responses.edge_leakage import slope_factor
 from estimator.responses.equalisation import THRESHOLD
 from estimator.spectra.welch import WelchSettings
@@ -186,7 +186,7 @@ class MethodPlan:
     is_motion_weak: bool
 
     @classmethod
-    def of(cls, entry: Plan) -> MethodPlan:
+    def of(cls, entry: TimePlan) -> MethodPlan:
         """Return the plan for the channel that needs the longest duration."""
         return cls(
             entry.method,

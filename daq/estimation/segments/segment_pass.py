@@ -32,7 +32,7 @@ from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
-from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
+from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -117,7 +117,7 @@ class GapBridge:
     def __init__(self, welch: WelchSettings, n_channels: int, *, most: float) -> None:
         self._welch, self._most = welch, most
         self.spectra = CrossSpectra(welch, n_channels, threads=1)
-        self.leakage = Leakage(get_window(welch.window, welch.segment_length))
+        self.leakage = WindowLeakage(get_window(welch.window, welch.segment_length))
 
     def take(
         self,
@@ -328,7 +328,7 @@ class Pass:
         return self._bridge.spectra.n_segments
 
     @property
-    def leakage(self) -> Leakage | None:
+    def leakage(self) -> WindowLeakage | None:
         """What the windows of these segments bring in."""
         return None if self._bridge is None else self._bridge.leakage
 

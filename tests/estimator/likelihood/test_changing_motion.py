@@ -11,7 +11,7 @@ from estimator.errors import InsufficientDataError
 from estimator.levels.interval import interval
 from estimator.likelihood.changing_motion import (
     STEADINESS,
-    BandNoise,
+    ChangingMotionNoise,
     band_noise,
     bound_of_parts,
 )
@@ -68,7 +68,7 @@ class Bench:
         *,
         shared: tuple[tuple[int, int], ...] = (),
         steadiness: float = STEADINESS,
-    ) -> BandNoise:
+    ) -> ChangingMotionNoise:
         """Return what the parts say of the noise."""
         return band_noise(
             *(csm, np.full(N_PARTS, float(AVERAGES))),
@@ -99,7 +99,7 @@ def changing(bench: Bench, size: float = CHANGING) -> FloatArray:
     return size * bench.rng.standard_normal(N_PARTS)
 
 
-def holds(found: BandNoise, bench: Bench) -> np.ndarray:
+def holds(found: ChangingMotionNoise, bench: Bench) -> np.ndarray:
     """Return whether each interval holds the noise, the lever included."""
     low, high = interval(found.level, found.cumulants)
     truth = np.diag(bench.noise)

@@ -7,7 +7,7 @@ import pytest
 
 from estimator.self_noise.three_sensor import three_sensor
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from estimator.spectra.windows import Leakage, gap_window, get_window, without_trend
+from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
 from tests.estimator.csm_models import rotation
 
 LENGTH = 512
@@ -49,7 +49,7 @@ def test_many_missing_blocks_cause_no_bias() -> None:
     samples[~usable] = 1e9
     settings = WelchSettings(2.0, LENGTH)  # noise PSD 1
     spectra = CrossSpectra(settings, 9)
-    leakage = Leakage(get_window("hann", LENGTH))
+    leakage = WindowLeakage(get_window("hann", LENGTH))
     for start in range(0, n - LENGTH + 1, LENGTH // 2):
         span = slice(start, start + LENGTH)
         weight = gap_window(usable[span], LENGTH)
@@ -72,7 +72,7 @@ def test_the_leakage_is_computed() -> None:
     frequency = np.fft.rfftfreq(LENGTH, 0.5)
     level = np.where(frequency < 0.3, 1.0, 1e-4)
     window = get_window("hann", LENGTH)
-    leakage = Leakage(window)
+    leakage = WindowLeakage(window)
     power = np.zeros(len(frequency))
     whole = np.zeros(len(frequency))
     for _ in range(400):
