@@ -241,7 +241,7 @@ class Ledger:
         found = [each for each in known if each.runs == runs and each.state != "void"]
         return found[-1] if found else None
 
-    def certified(self, path: Path, run_id: str, root: str) -> tuple[Entry | None, str]:
+    def certified(self, path: Path, run_id: str, root: str) -> tuple[LedgerEntry | None, str]:
         """Return the last certificate of a recording, and how the recording contradicts one.
 
         Parameters
