@@ -130,10 +130,8 @@ class Source:
         return self.recording.bench
 
 
-def sources(paths: Sequence[str | Path | Recording]) -> tuple[Source, ...]:
+def sources(paths: Sequence[str | Path]) -> tuple[Source, ...]:
     """Read what recordings, and those that continue them, say; growing ones up to now.
-
-    Of one that is open, and complete, what it said when it was opened.
 
     Raises
     ------
@@ -141,10 +139,7 @@ def sources(paths: Sequence[str | Path | Recording]) -> tuple[Source, ...]:
         If one cannot be read.
     """
     with contextlib.ExitStack() as opened:
-        recordings = [
-            each if isinstance(each, Recording) else opened.enter_context(Recording.open(each))
-            for each in paths
-        ]
+        recordings = [opened.enter_context(Recording.open(path)) for path in paths]
         for recording in tuple(recordings):
             following = continuations(recording, recordings)
             recordings.extend(map(opened.enter_context, following))

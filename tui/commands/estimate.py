@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
-    from daq.results.sources import Source
 
 
 @command(first="methods segment band unit response start end diagnostics json csv")
@@ -102,8 +101,7 @@ def estimate(
             " --response-for and --channels with files of other programs"
         )
     else:
-        whole, sources = noise_parameters, bool(json or csv)
-        result = estimated(files, start=start, end=end, whole=whole, sources=sources, **wanted)
+        result = estimated(files, start=start, end=end, whole=noise_parameters, **wanted)
         hint(f"For a report: huddle report {files[0]}")
     parameters = None
     if noise_parameters:
@@ -189,13 +187,11 @@ def estimated(
     start: str | None,
     end: str | None,
     whole: bool = False,
-    sources: bool = False,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> Result:
     """Estimate recordings, showing the progress.
 
     The whole bench takes as long to read as to estimate: without limits only where it is wanted.
-    With what recordings say of themselves, if the `sources` are wanted: one is still open then.
     """
     from daq.errors import NotARecordingError
     from daq.estimation.estimation import estimate
@@ -207,20 +203,15 @@ def estimated(
         raise NotARecordingError(
             f"{files[0]}: not a huddle recording; convert it: {import_command(files)}"
         )
-    examined: tuple[Source, ...] = ()
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
         counted("segments", waits=True) as count,
     ):
         settings = settings_of(first, start=start, end=end, **wanted)
         snapshot = estimate([first, *files[1:]], settings, progress=count)
-        if sources and first.closed:
-            from daq.results.sources import sources as sources_of
-
-            examined = sources_of([first, *files[1:]])
     outline = first.outline
     bench = first.bench if whole or (outline is not None and outline.has_limits) else None
-    return Result(snapshot, settings, bench, tuple(files), examined)
+    return Result(snapshot, settings, bench, tuple(files))
 
 
 def show_result(

@@ -11,7 +11,6 @@ from daq.bench.loading import parse
 from daq.protocols.block import HostTime, Quantity
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.recording.reader import Recording
 from daq.results.sources import conditions, sources
 
 START = datetime(2026, 11, 25, 12, tzinfo=UTC)
@@ -52,8 +51,7 @@ def written(path: Path, *, temperature: float | None = None) -> Path:
 
 
 def test_all_readings_are_those_of_the_whole_test(tmp_path: Path) -> None:
-    with Recording.open(written(tmp_path / "r.h5")) as opened:
-        found = sources([opened])  # as by its path
+    found = sources([written(tmp_path / "r.h5")])
     a, b, host = conditions(found, found[0].bench)
     assert (a.sensor, a.lowest, a.highest, a.n_readings) == ("a", 0.0, 50.0, 601)
     assert (a.limits, a.is_outside) == ((0, 40), True)
