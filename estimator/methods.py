@@ -13,7 +13,7 @@ from estimator.levels.interval import unpredicted
 from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import EQUATIONS, most_pooled, pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
-from estimator.self_noise.coherency import coherency
+from estimator.self_noise.coherency import check_averages, coherency
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_channel import three_channel
 from estimator.self_noise.three_sensor import three_sensor
@@ -104,8 +104,11 @@ def self_noise(
             f"real of shape {is_real.shape} and type {is_real.dtype}, expected bool of"
             f" ({len(csm)},)"
         )
-    n_dims = _dimensions(options.get("n_factors"), dims, len(csm))
     by_engine = blocks is not None and method in {"three-sensor", "maximum-likelihood"}
+    n_dims = np.zeros(0, np.int64)
+    if by_engine:
+        check_averages(n_effective)
+        n_dims = _dimensions(options.get("n_factors"), dims, len(csm))
     found, last = known, False
     if found is None and by_engine and method == "maximum-likelihood":
         options["matrices"] = False  # the engine has them
@@ -164,8 +167,10 @@ def _only_where_asked(csm: ComplexArray, dims: tuple[int, ...], n_dims: IntArray
 
 
 def _dimensions(n_factors: int | IntArray | None, dims: tuple[int, ...], n_freqs: int) -> IntArray:
-    wanted = _shared(dims) if n_factors is None else n_factors
-    return np.broadcast_to(np.asarray(wanted, np.int64), (n_freqs,))
+    wanted = np.asarray(_shared(dims) if n_factors is None else n_factors, np.int64)
+    if wanted.shape not in {(), (n_freqs,)}:
+        raise EstimatorError(f"n_factors of shape {wanted.shape}, expected () or ({n_freqs},)")
+    return np.broadcast_to(wanted, (n_freqs,))
 
 
 def _shared(dims: tuple[int, ...]) -> int:

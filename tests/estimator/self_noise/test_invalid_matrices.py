@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -158,3 +161,11 @@ def test_invalid_arguments_are_refused(method: str) -> None:
 def test_an_unknown_method_is_refused_with_the_known_names() -> None:
     with pytest.raises(UnknownMethodError, match=r"'magic'.*three-sensor"):
         self_noise("magic", spoilt("nan"), dims=(3, 3, 3), n_effective=60)
+
+
+def test_options_are_checked_before_the_engine_takes_them() -> None:
+    csm, blocks = np.broadcast_to(np.eye(4) + 0j, (9, 4, 4)), np.zeros(9, np.int64)
+    for wrong in ({"n_factors": np.ones(5, np.int64)}, {"n_effective": math.nan}):
+        given: dict[str, Any] = {"dims": (1,) * 4, "n_effective": 50.0, "blocks": blocks, **wrong}
+        with pytest.raises(EstimatorError, match=r"expected \(\) or \(9,\)|nan effective"):
+            self_noise("maximum-likelihood", csm, **given)
