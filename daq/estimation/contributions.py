@@ -25,7 +25,7 @@ from estimator.levels.contributions import (
     deviation,
     widened,
 )
-from estimator.levels.interval import NORMAL_95, interval
+from estimator.levels.interval import NORMAL_95, further_motion, interval, unpredicted
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, most_testable
 from estimator.self_noise.result import Flag, SelfNoise
@@ -41,6 +41,9 @@ MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
 """Share of the noise that changes of responses may be, from which all of it may be."""
+MUCH_FURTHER = 0.01
+"""Power of a further dimension over that of the usual ones from which it may be noise that all
+sensors share: a lean of 5° or gradients of 5 % leave less."""
 MUCH_LEAKS = 0.5
 """Share of the noise that leakage at the edges of segments may be, from which all of it may be."""
 MUCH_NONLINEAR = 0.05
@@ -365,14 +368,35 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
     return parts
 
 
-def two_may_share(snapshot: Snapshot) -> BoolArray:
-    """Return where two of three sensors may share noise, which two being unknown, (n_freqs,)."""
-    frequency, found = snapshot.frequency, np.zeros(len(snapshot.frequency), np.bool_)
-    for advice in snapshot.diagnostics.advice if len(snapshot.dims) == _THREE else ():
-        doubts = isinstance(advice, ModelMisfit | NoSharedMotion)
+def may_share(snapshot: Snapshot) -> tuple[BoolArray, BoolArray]:
+    """Return where all sensors may share noise, and where two of three may, (n_freqs,) each.
+
+    It is where no model that the sensors allow explains the averages; all may share what is too
+    strong to be tilt or gradients of the motion.
+    """
+    frequency, dims, csm = snapshot.frequency, snapshot.dims, snapshot.csm
+    every, two = np.zeros((2, len(frequency)), np.bool_)
+    for low, high in _unexplained(snapshot):
+        at = np.flatnonzero((frequency >= low) & (frequency <= high))
+        averages = np.full(len(at), snapshot.n_effective)
+        rest, _ = unpredicted(csm[at], dims=dims, n_effective=averages)
+        further = further_motion(csm[at], rest, max(dims), snapshot.n_effective)
+        every[at] = further > MUCH_FURTHER
+        two[at] = not snapshot.diagnostics.dimensions or len(dims) == _THREE
+    return every, two
+
+
+def _unexplained(snapshot: Snapshot) -> Iterator[tuple[float, float]]:
+    """Yield the bands, in Hz, whose averages no model that the sensors allow explains."""
+    choices = snapshot.diagnostics.dimensions
+    for choice in choices:
+        if choice.is_biased or choice.is_undetermined:
+            yield choice.low, choice.high
+    for advice in () if choices else snapshot.diagnostics.advice:
+        three = len(snapshot.dims) == _THREE
+        doubts = isinstance(advice, ModelMisfit) or (isinstance(advice, NoSharedMotion) and three)
         if doubts and advice.band is not None and advice.rank is not Rank.TO_KNOW:
-            found |= (frequency >= advice.band[0]) & (frequency <= advice.band[1])
-    return found
+            yield advice.band
 
 
 def _taken_for_motion(snapshot: Snapshot, method: str) -> FloatArray:
@@ -409,6 +433,7 @@ def _of_two(snapshot: Snapshot, method: str, psd: FloatArray) -> Iterator[Contri
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:
     """Return what failed tests of the model allow, as shares, shape (n_freqs,) each."""
     frequency = snapshot.frequency
+    every = may_share(snapshot)[0]
     found = {source: np.zeros(len(frequency)) for source in (Source.MISFIT, Source.SHARED_NOISE)}
     for advice in snapshot.diagnostics.advice:
         if advice.band is None or advice.rank is Rank.TO_KNOW:
@@ -417,7 +442,8 @@ def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArra
         source, error = Source.MISFIT, 0.0
         if isinstance(advice, ModelMisfit):
             here &= ~explained
-            error = advice.error if advice.error < NOTHING_USEFUL else math.inf
+            useful = advice.error < NOTHING_USEFUL and not every[here].any()
+            error = advice.error if useful else math.inf
         elif isinstance(advice, SharedNoise):
             source, error = Source.SHARED_NOISE, advice.harm
         elif isinstance(advice, TooFewDimensions):

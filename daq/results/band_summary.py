@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.estimation.contributions import contributions, shared_parts, two_may_share
+from daq.estimation.contributions import contributions, may_share, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot
@@ -27,8 +27,21 @@ from estimator.levels.bands import (
     bin_correlation,
     third_octaves,
 )
-from estimator.levels.contributions import Contribution, Source, by_chance, deviation, widened
-from estimator.levels.interval import NORMAL_95, interval, unpredicted, unpredicted_by_one
+from estimator.levels.contributions import (
+    Contribution,
+    Source,
+    by_chance,
+    deviation,
+    up_to,
+    widened,
+)
+from estimator.levels.interval import (
+    NORMAL_95,
+    interval,
+    like_psd,
+    unpredicted,
+    unpredicted_by_one,
+)
 from estimator.median import median_of_columns
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag, SelfNoise
@@ -222,6 +235,8 @@ class Spectrum:
         self._shares[:, [label.sensor in paired for label in snapshot.channels]] = True
         if (alike := snapshot.rounded_alike) is not None:
             self._shares |= alike.most > MUCH_SHARED * np.nan_to_num(np.abs(noise.noise_psd))
+        self._doubtful = may_share(snapshot)
+        self._shares &= ~self._doubtful[0][:, None]  # bounded by its own spectrum
         known = np.isfinite(noise.noise_psd)
         self._weight = np.where(known, self._width[:, None], 0.0)
         self._anything = known & np.logical_or.reduce(
@@ -251,7 +266,8 @@ class Spectrum:
         if below.any():
             psd, cumulants = np.where(below, np.minimum(psd, rest), psd), cumulants.copy()
             cumulants[:, below] = scatter[:, below]
-            parts = [each.up_to(rest, below, psd) for each in parts]
+            inside = np.repeat(np.logical_or.reduceat(below, edges[:-1]), np.diff(edges), axis=0)
+            parts = list(up_to(parts, rest, below, psd, inside))
         found = band_levels(psd, cumulants, edges, correlation, weights=width)
         widening = tuple(each.in_bands(edges, weight, psd) for each in parts)
         unknown = (noise.flags[here] & Flag.UNIDENTIFIED) != 0
@@ -279,13 +295,15 @@ class Spectrum:
             rest, scatter = unpredicted(
                 snapshot.csm[inside], dims=snapshot.dims, n_effective=averages
             )
-            doubtful = np.flatnonzero(two_may_share(snapshot)[inside])
-            if len(doubtful):
-                rest[doubtful], scatter[:, doubtful] = unpredicted_by_one(
-                    snapshot.csm[inside][doubtful],
-                    dims=snapshot.dims,
-                    n_effective=averages[doubtful],
+            every, two = (np.flatnonzero(each[inside]) for each in self._doubtful)
+            if len(two):
+                rest[two], scatter[:, two] = unpredicted_by_one(
+                    snapshot.csm[inside][two], dims=snapshot.dims, n_effective=averages[two]
                 )
+            if len(every):  # then no channel's noise exceeds its own spectrum
+                rest[every] = np.einsum("fii->fi", snapshot.csm[inside][every]).real
+                of_psd = rest[every] / np.sqrt(averages[every])[:, None]
+                scatter[:, every] = like_psd(rest[every], of_psd)
             self._bound = (inside, rest, scatter)
         return inside.start, rest, scatter
 

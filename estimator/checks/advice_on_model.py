@@ -266,16 +266,16 @@ def effect_of_misfit(advice: ModelMisfit, names: Names) -> str:
     else:
         channels = several(max(names.dims), "channel")
         at_most = f"by any amount {apart}, which three sensors of {channels} cannot detect"
-    two_share = ""
+    share = " Or all sensors share noise."
     if len(names.dims) == _THREE:
-        two_share = (
+        share += (
             f" Or two of {listed(names.sensors)} share noise: three sensors do not tell which two; "
             "the intervals reach up to all of it."
         )
     verdict = "is wrong" if advice.is_wrong else "may be wrong"
     return (
         f"Up to {percent(advice.unexplained)} of the noise is unexplained. The estimate {verdict} "
-        f"by up to about {percent(advice.error)} of the noise, and {at_most}." + two_share
+        f"by up to about {percent(advice.error)} of the noise, and {at_most}." + share
     )
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import REJECT, upper_tail
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
+from estimator.likelihood.shared_by_two import SHARING
 from estimator.median import median
 from estimator.records import dataclass
 from estimator.self_noise.three_sensor import three_sensor
@@ -164,7 +165,7 @@ def shared_noise(
     others = [
         (step, int(other))
         for step in range(len(chosen))
-        for other in _alternatives(there, chosen, step)
+        for other in _alternatives(there, chosen, step, dims)
     ]
     choices = [chosen] + [_in_place(chosen, step, other) for step, other in others]
     inside = np.any([bands[n] for n in of_bands], axis=0)
@@ -248,12 +249,18 @@ def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArr
     return chosen[np.abs(amount) > BAND_SIGNIFICANCE * error]
 
 
-def _alternatives(scores: Scores, chosen: IntArray, step: int) -> IntArray:
-    """Return the pairs that explain the scores about as well as one of the chosen pairs."""
+def _alternatives(scores: Scores, chosen: IntArray, step: int, dims: tuple[int, ...]) -> IntArray:
+    """Return the pairs that explain the scores about as well as one of the chosen pairs.
+
+    Of four channels so do the other two, by other gains (`shared_by_two`), whatever scores show.
+    """
     z = scores.without(np.delete(chosen, step)).z
     own = float(z[chosen[step]] ** 2)
     z[chosen] = 0.0
-    return np.flatnonzero((z**2 > own - AMBIGUITY) & (z**2 > AMBIGUITY))
+    alike = (z**2 > own - AMBIGUITY) & (z**2 > AMBIGUITY)
+    if len(dims) == sum(dims) == SHARING:
+        alike |= ~np.isin(scores.pairs, scores.pairs[chosen[step]]).any(axis=1)
+    return np.setdiff1d(np.flatnonzero(alike), chosen)
 
 
 def _in_place(chosen: IntArray, step: int, other: int) -> IntArray:

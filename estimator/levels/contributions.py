@@ -15,7 +15,7 @@ too high or too low. The model test of three sensors cannot see it. For leans of
 from __future__ import annotations
 
 import enum
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -109,20 +109,6 @@ class Contribution:
         """Return the contribution at some bins."""
         return replace(self, below=self.below[bins], above=self.above[bins], share=self.share[bins])
 
-    def up_to(self, bound: FloatArray, where: BoolArray, level: FloatArray) -> Contribution:
-        """Return the contribution from zero to a bound `where` it is infinite, and no other there.
-
-        `level` is the noise, at the bound at most.
-        """
-        anything = where & np.isinf(self.share + self.above)
-        below, above, share = (
-            np.where(anything, other, np.where(where, 0.0, own))
-            for own, other in (
-                (self.below, np.maximum(level, 0.0)), (self.above, bound - level), (self.share, 0.0)
-            )
-        )  # fmt: skip
-        return replace(self, below=below, above=above, share=share)
-
     def in_bands(
         self, edges: NDArray[np.int64], weight: FloatArray, psd: FloatArray
     ) -> Contribution:
@@ -130,8 +116,8 @@ class Contribution:
 
         Bins err together, so that offsets are averaged with weights, and shares with these and the
         noise; of arrays of shape (n_freqs, n_channels). The weight is 0 where the noise is not
-        known. Where nothing is known of a part of a band, nothing is known of the band: `up_to`
-        tells what is.
+        known. Where nothing is known of a part of a band, nothing is known of the band, but by
+        `up_to`.
         """
         first, last, starts = int(edges[0]), int(edges[-1]), edges[:-1] - edges[0]
 
@@ -153,6 +139,41 @@ class Contribution:
             mean(self.above, weight),
             np.where(unknown, np.inf, share),
             self.deviation,
+        )
+
+
+def up_to(
+    parts: Iterable[Contribution],
+    bound: FloatArray,
+    where: BoolArray,
+    level: FloatArray,
+    inside: BoolArray,
+) -> Iterator[Contribution]:
+    """Yield contributions from zero to a bound `where` any is infinite, and no other there.
+
+    Parameters
+    ----------
+    parts : iterable of Contribution
+    bound, where : float64, bool, shape (n_freqs, n_channels)
+    level : float64, shape (n_freqs, n_channels)
+        The noise, at the bound at most.
+    inside : bool, shape (n_freqs, n_channels)
+        Bins of the bands with such bins. Their other shares become offsets: a share of the mean
+        would be one of what the bound allows, too.
+    """
+    taken = np.zeros(where.shape, np.bool_)
+    for each in parts:
+        anything = where & np.isinf(each.share + each.above) & ~taken
+        taken |= anything
+        finite = inside & ~where & np.isfinite(each.share)
+        offset = np.where(finite, each.share, 0.0) * np.nan_to_num(np.abs(level))
+        yield replace(
+            each,
+            below=np.where(
+                where, np.where(anything, np.maximum(level, 0.0), 0.0), each.below + offset
+            ),
+            above=np.where(where, np.where(anything, bound - level, 0.0), each.above + offset),
+            share=np.where(where | finite, 0.0, each.share),
         )
 
 

@@ -271,6 +271,35 @@ def unpredicted_by_one(
     return level, scatter
 
 
+def further_motion(
+    csm: ComplexArray, noise: FloatArray, n_factors: int, n_effective: float
+) -> float:
+    """Return the power of one dimension more than `n_factors` over that of these, in a band.
+
+    Parameters
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+    noise : float64, shape (n_freqs, n_channels)
+        What others do not predict; frequencies where it is not known do not count.
+    n_factors : int
+    n_effective : float
+        Independent averages: of fewer, noise looks more like a dimension.
+
+    Returns
+    -------
+    float
+        Zero where nothing stands out of the noise.
+    """
+    good = np.isfinite(noise).all(axis=1) & (noise > 0).all(axis=1)
+    if not good.any():
+        return 0.0
+    scale = 1 / np.sqrt(noise[good])
+    power = np.linalg.eigvalsh(csm[good] * scale[:, :, None] * scale[:, None, :]).mean(axis=0)
+    rest = power[: -n_factors - 1].mean()
+    more = power[-n_factors - 1] - rest * (1 + np.sqrt(csm.shape[1] / n_effective)) ** 2
+    return float(max(more, 0.0) / (power[-n_factors:].mean() - rest))
+
+
 def _unpredicted(
     csm: ComplexArray, psd: FloatArray, dims: tuple[int, ...], n_effective: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -144,7 +144,7 @@ class PairSearch:
         found: dict[int, Sharing] = {}
         for b in tried:
             q = self._usual if b in rejected else min(len(tried[b]) - 2, self._usual)
-            if q >= 0 and (its := self._sharing(q, b)) is not None:
+            if q >= 0 and (its := self._sharing(q, b, any_pair=b in rejected)) is not None:
                 found[b] = its
         known = dict.fromkeys(pair for each in found.values() for pair in each.pairs)
         for b in [b for b in tried if b not in found] if known else ():
@@ -152,14 +152,17 @@ class PairSearch:
                 found[b] = its
         return found
 
-    def _sharing(self, q: int, band: int) -> Sharing | None:
+    def _sharing(self, q: int, band: int, *, any_pair: bool) -> Sharing | None:
         """Return the sensors that share noise, if that explains a band with q dimensions or fewer.
 
-        One more dimension explains it as well, or none does.
+        One more dimension explains it as well, or none does: then `any_pair` of four sensors is
+        tried, whose dimensions beyond the motion show no share.
         """
         share = self._local[band]
         every = sorted(combinations(self._alone.tolist(), 2), key=lambda pair: -share[pair])
         likely = [each for each in every if share[each] > LOCAL][:CANDIDATES]
+        few = len(self._dims) == SHARING
+        likely = every if few and any_pair else likely
         pairs: list[Pair] = []
         at = self._test(q, band, self._alone) if likely else None
         while at is not None and not (pairs and at[0].p_value > self._level):
@@ -180,8 +183,15 @@ class PairSearch:
             if _excess(at) - _excess(tests[best]) < max(EXPLAINS * total, 0.0):
                 return None
             pairs, at = [*pairs, best], tests[best]
-        few = len(self._dims) == SHARING
         return None if at is None else self._fewest(q, at, pairs, band, every if few else likely)
+
+    def _mirrors(self, pair: Pair, other: Pair) -> bool:
+        """Whether one pair of four channels explains what the other two share.
+
+        Gains of one pair up by a factor t, of the other down, leave the products across them: what
+        (0, 1) share beyond the motion, (2, 3) lack then.
+        """
+        return len(self._dims) == sum(self._dims) == SHARING and not {*pair} & {*other}
 
     def _as_elsewhere(self, q: int, band: int, pairs: list[Pair]) -> Sharing | None:
         """Return the pairs of other bands, if they save a dimension here, or show."""
@@ -208,7 +218,10 @@ class PairSearch:
             for each in (others if len(pairs) == 1 else ())
             if each not in pairs
             and (other := self._test(q, band, _groups(self._alone, [each])))
-            and _excess(other) - _excess(at) < AMBIGUITY
+            and (
+                _excess(other) - _excess(at) < AMBIGUITY
+                or (self._mirrors(each, pairs[0]) and other[0].p_value > self._level)
+            )
         ]
         return Sharing(
             n_factors=q,

@@ -88,10 +88,11 @@ class ModelPasses(Fact):
     dims: tuple[int, ...]
 
     def _words(self) -> Words:
+        two = "or two of these three " if self.dims == (1, 1, 1) else ""  # the test has one degree
         return Words(
             "The model test passes in all bands",
             f"The model test passes in all bands: {model(self.n_factors, self.dims)} explains "
-            "what the sensors have in common.",
+            f"what the sensors have in common. Assumed: no noise that all {two}sensors share.",
         )
 
 
@@ -159,7 +160,7 @@ class DimensionsUndetermined(Fact):
         return Words(
             f"{head}: use six sensors, or put them closer together",
             f"{head}. More dimensions explain the averages, but {self.n_sensors} sensors cannot "
-            "tell them from noise: the noise estimate may be wrong by any amount.",
+            "tell them from noise, which all may share: the estimate may be wrong by any amount.",
             "Use six sensors, or put them closer together.",
         )
 

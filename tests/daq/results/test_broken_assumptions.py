@@ -101,3 +101,18 @@ def test_a_band_that_no_dimension_explains_costs_a_mean_its_own_share() -> None:
     for each in result.means(result.method, (2.0, 40.0)):
         assert 0.3 * true < each.low[0] < true < each.high[0] < 3 * true
         assert np.isfinite(each.estimate[0])
+
+
+@pytest.mark.parametrize("n_sensors", [3, pytest.param(4, marks=pytest.mark.long)])
+def test_noise_that_all_sensors_share_is_in_the_intervals(n_sensors: int) -> None:
+    """No bound by the others, which predict it; no finite interval where the test fails."""
+    rng = np.random.default_rng(1)
+    samples = np.array(felt(rng, n_sensors, 3.0))[:, : N_SAMPLES // 6]
+    samples += 2 * rng.standard_normal((samples.shape[1], 1))
+    samples += rng.standard_normal(samples.shape)
+    recording = recording_of_arrays({f"s{i}": each for i, each in enumerate(samples)}, RATE)
+    settings = Settings(segment=1.0)
+    result, true = Result(estimate([recording], settings), settings), 5 * 2 / RATE
+    for each in (each for band in BANDS for each in result.means(result.method, band)):
+        assert np.isneginf(each.low[0])
+        assert true < each.high[0] < 4 * true

@@ -10,6 +10,7 @@ import pytest
 from daq.results.band_summary import band_of
 from daq.results.result import Result
 from estimator.levels.bands import band_edges, band_levels, bin_correlation, log_edges
+from estimator.levels.contributions import Source, contribution, up_to, widened
 from estimator.levels.interval import like_psd
 from estimator.median import median_of_columns
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
@@ -104,3 +105,19 @@ def test_median_of_columns_agrees_with_numpy() -> None:
             np.testing.assert_array_equal(median, np.median(known) if known.size else np.nan)
         assert np.isnan(found[1])
     assert np.isnan(median_of_columns(np.empty((0, 3)))).all()
+
+
+def test_shares_elsewhere_do_not_shrink_beside_bins_that_only_a_bound_tells() -> None:
+    """Level 1 within a half, and 10 within 0 and 20, of two causes: mean within 0.25 and 10.75."""
+    level, bound, edges = np.array([[1.0], [10.0]]), np.array([[1.0], [20.0]]), np.array([0, 2])
+    shares = ([[0.5], [np.inf]], [[0.0], [np.inf]])
+    parts = [contribution(Source.MISFIT, (2, 1), share=np.array(each)) for each in shares]
+    where, inside = np.array([[False], [True]]), np.ones((2, 1), np.bool_)
+    found = [
+        each.in_bands(edges, np.ones((2, 1)), level)
+        for each in up_to(parts, bound, where, level, inside)
+    ]
+    mean = level.mean(axis=0)[None]
+    low, high = widened(mean, mean, found)
+    assert low[0, 0] == pytest.approx(0.25)
+    assert high[0, 0] == pytest.approx(10.75)

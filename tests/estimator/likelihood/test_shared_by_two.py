@@ -10,6 +10,7 @@ from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.facts.model import SharedByTwo
 from daq.results.result import Result
+from estimator.checks.advice_on_noise import SharedNoise
 
 RATE, SECONDS = 100.0, 120.0
 UNIT = 2 / RATE
@@ -67,6 +68,19 @@ def test_noise_of_two_of_three_sensors_is_in_the_intervals_of_all(ratio: float, 
         means = result.means(result.method, band)
         for noise, true in zip(means, truth, strict=True):
             assert noise.low[0] <= true <= noise.high[0]
+
+
+@pytest.mark.parametrize("ratio", [1.0, 100.0, 1e4])
+def test_two_of_four_channels_are_never_named_without_the_other_two(ratio: float) -> None:
+    """Other gains explain what A and B share as noise of C and D: upper ends were at a tenth."""
+    settings = Settings(segment=2.0, methods=("auto",))
+    samples = recorded(4, 1, ratio, np.random.default_rng([46, 4]))
+    result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    for noise, true in zip(result.means(result.method, (2.0, 40.0)), (17, 17, 1, 1), strict=True):
+        assert noise.low[0] <= true * UNIT <= noise.high[0]
+    advice = [each for each in result.snapshot.diagnostics.advice if isinstance(each, SharedNoise)]
+    named = {pair for each in advice for pair in (*each.channels, *each.alternatives)}
+    assert not named or {(0, 1), (2, 3)} <= named
 
 
 @pytest.mark.parametrize(("n_sensors", "d"), [(4, 3), (6, 1), (8, 3)])

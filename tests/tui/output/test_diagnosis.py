@@ -179,7 +179,8 @@ def test_too_few_averages_for_the_model_test_are_said() -> None:
 
 
 def test_the_model_that_is_tested_is_the_one_that_gave_the_numbers() -> None:
-    explained = "one common motion explains what the sensors have in common."
+    explained = "one common motion explains what the sensors have in common. "
+    explained += "Assumed: no noise that all sensors share."
     assert f"The model test passes in all bands: {explained}" in said(diagnosed())
     for n_factors, model in ((0, "a model without motion"), (1, "one motion of 1 dimension")):
         lines = said(diagnosed(n_factors=n_factors))
