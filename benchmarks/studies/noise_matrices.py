@@ -1,7 +1,8 @@
 """Levels of `auto` where the noise of a sensor is a matrix: coverage, and width over the bound.
 
-``python -m benchmarks.studies.noise_matrices [DRAWS]`` prints the table of
-``docs/validation/noise-matrices.md``: Wishart matrices of ``A A* + N``, sensors in any direction.
+``python -m benchmarks.studies.noise_matrices [DRAWS [SENSORS,CHANNELS [AVERAGES]]]`` prints the
+table of ``docs/validation/noise-matrices.md``: Wishart matrices of ``A A* + N``, sensors in any
+direction.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +18,22 @@ from numpy.typing import NDArray
 from benchmarks.studies.draws import averaged
 from estimator.levels.bands import band_levels
 from estimator.levels.interval import NORMAL_95
+from estimator.likelihood.dimension import choose_dimension, noise_groups
 from estimator.methods import self_noise
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-RATIOS = (0.05, 0.1, 0.3, 1.0, 10.0, 100.0, 1e4)
+RATIOS = (0.0, 0.05, 0.3, 1.0, 10.0, 100.0, 1e4, 1e5)
+LAYOUTS = tuple(product((3, 4, 6, 8, 12), (3, 2, 1)))
 AVERAGES = (20, 60, 200)
 N_BINS = 40
 DRAWS = 40
-SHARED = (4.0, 2.0, 0.0)
-"""Amplitudes, over that of its own noise, of a source in the channels of the second sensor."""
-INDEPENDENT, WITHIN = "none", "one sensor"
+SHARED = ((4.0, 2.0, 0.0), (0.0, 1.0, 3.0))
+"""Amplitudes, over that of its own noise, of two sources in the channels of the second sensor."""
+UVW = np.array([[2, 0, 2**0.5], [-1, 3**0.5, 2**0.5], [-1, -(3**0.5), 2**0.5]]) / 6**0.5
+INDEPENDENT, WITHIN, RANK_TWO, ELEMENT = "none", "one sensor", "rank two", "one UVW element"
+PAIR = "two sensors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +49,12 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Of the intervals of band levels: coverage, median width over the bound; mean over truth."""
+    """Of the intervals of band levels: coverage, median width over the bound; pairs named."""
 
     coverage: float
     of_shared: float
     width: float
-    mean: float
+    named: float
     n: int
 
 
@@ -62,9 +68,15 @@ def scene(cell: Cell, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]
     loadings = np.concatenate(turned) * np.sqrt(cell.ratio * np.array([1.0, 1.4, 0.7])[:d])
     loadings *= 1 + 0.02 * rng.standard_normal((len(loadings), 1))
     noise = np.eye(len(loadings))
-    if cell.shared == WITHIN:
-        own = slice(d, 2 * d)
-        noise[own, own] += np.outer(SHARED[:d], SHARED[:d])
+    sources = np.array(SHARED)[: 2 if cell.shared == RANK_TWO else 1, :d]
+    own, both = slice(d, 2 * d), slice(d, 3 * d)
+    if cell.shared in {WITHIN, RANK_TWO}:
+        noise[own, own] += sources.T @ sources
+    elif cell.shared == ELEMENT:
+        noise[own, own] += 3 * np.outer(UVW[0], UVW[0])
+    elif cell.shared == PAIR:
+        twice = np.append(sources[0], np.roll(sources[0], 1))
+        noise[both, both] += np.outer(twice, twice)
     return loadings, noise
 
 
@@ -101,49 +113,66 @@ def bound(loadings: FloatArray, noise: FloatArray, d: int, averages: float) -> F
 
 def study(cell: Cell, n_draws: int, *, seed: int = 46) -> Found:
     """Return what the intervals of a band are, over all draws and channels."""
-    held, widths, ratios = [], [], []
+    held, widths, named = [], [], []
     for draw in range(n_draws):
         rng = np.random.default_rng([seed, draw, cell.n_sensors, cell.d, cell.n])
         loadings, noise = scene(cell, rng)
         csm = np.broadcast_to(loadings @ loadings.T + noise, (N_BINS, *noise.shape))
+        drawn = averaged(csm.astype(np.complex128), cell.n, rng)
+        dims, block = (cell.d,) * cell.n_sensors, np.zeros(N_BINS, np.int64)
+        options: dict[str, Any] = {}
+        reach = np.ones((2, len(noise)))
+        if cell.shared == PAIR:
+            frequency, n = np.arange(1.0, N_BINS + 1), float(cell.n)
+            q, (choice,) = choose_dimension(drawn, frequency, dims=dims, n_effective=n, band=block)
+            groups = noise_groups([choice], frequency, cell.n_sensors)
+            options = {"n_factors": q, "groups": groups}
+            reach = np.array([choice.least, choice.most]) if choice.pairs else reach
+            named.append(bool(choice.pairs))
         found = self_noise(
             "three-sensor" if cell.n_sensors == 3 else "maximum-likelihood",
-            averaged(csm.astype(np.complex128), cell.n, rng),
-            dims=(cell.d,) * cell.n_sensors,
+            drawn,
+            dims=dims,
             n_effective=float(cell.n),
-            blocks=np.zeros(N_BINS, np.int64),
+            blocks=block,
+            **options,
         )
         level = band_levels(found.noise_psd, found.cumulants, np.array([0, N_BINS]), np.ones(1))
-        low, high = level.interval()
+        low, high = (end * by for end, by in zip(level.interval(), reach, strict=True))
         truth = np.diag(noise)
         held.append((low[0] <= truth) & (truth <= high[0]))
+        if cell.shared == PAIR:  # no bound: that of one matrix for both
+            continue
         least = NORMAL_95 * bound(loadings, noise, cell.d, cell.n * N_BINS)
         widths.append((high - low)[0] / 2 / least)
-        ratios.append(level.mean[0] / truth)
     second = np.array(held)[:, cell.d : 2 * cell.d]
     return Found(
         coverage=float(np.mean(held)),
         of_shared=float(np.mean(second)),
-        width=float(np.median(widths)),
-        mean=float(np.mean(ratios)),
+        width=float(np.median(widths)) if widths else np.nan,
+        named=float(np.mean(named)) if named else np.nan,
         n=int(np.size(held)),
     )
 
 
-def main(n_draws: int) -> None:
+def main(n_draws: int, layouts: tuple[tuple[int, int], ...], averages: tuple[int, ...]) -> None:
     """Print a row for each layout, number of averages and shared noise, a column for each ratio."""
     print("| sensors, channels | averages | shared noise | " + " | ".join(f"{r:g}" for r in RATIOS))
     print("|---|---|---|" + "---|" * len(RATIOS))
-    for (s, d), n, shared in product(
-        ((3, 3), (3, 2), (3, 1), (4, 3), (6, 3), (8, 3)), AVERAGES, (INDEPENDENT, WITHIN)
-    ):
-        if (d == 1 and shared == WITHIN) or n <= s * d:
-            continue
-        draws = max(2, -(-n_draws * 9 // (s * d)))
-        cells = [study(Cell(s, d, ratio, n, shared), draws) for ratio in RATIOS]
-        row = [f"{c.coverage:.3f} {c.width:.2f}" for c in cells]
-        print(f"| {s}, {d} | {n} | {shared} | {' | '.join(row)} |", flush=True)
+    for (s, d), n in product(layouts, averages):
+        shared = (INDEPENDENT, WITHIN, RANK_TWO, ELEMENT)[: 1 if d == 1 else 2 if d == 2 else 4]
+        for kind in (*shared, *(() if s == 3 else (PAIR,))) if n > s * d else ():
+            draws = max(2, -(-n_draws * 9 // (s * d)))
+            cells = [study(Cell(s, d, ratio, n, kind), draws) for ratio in RATIOS]
+            row = [f"{c.coverage:.3f} {c.named if kind == PAIR else c.width:.2f}" for c in cells]
+            print(f"| {s}, {d} | {n} | {kind} | {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else DRAWS)
+    _, *given = sys.argv
+    numbers = [tuple(map(int, each.split(","))) for each in given]
+    main(
+        numbers[0][0] if numbers else DRAWS,
+        (numbers[1][:2],) if len(numbers) > 1 else LAYOUTS,  # type: ignore[arg-type]
+        numbers[2] if len(numbers) > 2 else AVERAGES,
+    )
