@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 from tests.tui.certificate.laboratory import Laboratory, laboratory
+from tui.page.blocks import Report
+from tui.page.pdf import write_paper
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -20,11 +24,25 @@ def empty_figures() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def issued(tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
+def drawn_up() -> list[Report]:
+    """Return what pages were made of, since `issued` was made."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def issued(tmp_path_factory: pytest.TempPathFactory, drawn_up: list[Report]) -> Laboratory:
     """Make a laboratory with one certificate; tests that change it take a copy."""
-    folder = tmp_path_factory.mktemp("laboratory")
-    made = laboratory(folder)
-    made.issue()
+    made = laboratory(tmp_path_factory.mktemp("laboratory"))
+
+    def noted(
+        report: Report, file: BinaryIO, *, attached: list[tuple[str, str, bytes]], at: datetime
+    ) -> None:
+        drawn_up.append(report)
+        write_paper(report, file, attached=attached, at=at)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tui.certificate.issuing.write_paper", noted)
+        made.issue()
     return made
 
 

@@ -10,8 +10,9 @@ import re
 import sqlite3
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from importlib.metadata import version
 from pathlib import Path
 
 import h5py
@@ -27,11 +28,12 @@ from daq.recording.repair import write_results
 from daq.recording.signing import identity, make_key, sign
 from tests.tui.certificate.laboratory import CALIBRATED, Laboratory, laboratory, text_of
 from tests.tui.night_recording import record
-from tests.tui.report.written_report import ROOT
+from tests.tui.report.written_report import ROOT, lines_of
 from tui.certificate.dcc import NAME
 from tui.certificate.ledger import Ledger
 from tui.certificate.verification import JSON_NAME
 from tui.commands.main import app
+from tui.page.blocks import Report
 from tui.service.records.store import NAME as RUNS
 
 NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
@@ -142,6 +144,41 @@ def test_the_dcc_is_valid_by_the_schema_of_the_ptb(issued: Laboratory, tmp_path:
     tree = etree.parse(draft)
     schema.assertValid(tree)
     assert tree.xpath("//dcc:statement[contains(., 'DRAFT')]", namespaces=NAMESPACES)
+
+
+@pytest.mark.parametrize("form", ["pages", "dcc"])
+def test_every_cell_of_a_certificate_is_as_kept(
+    issued: Laboratory, drawn_up: list[Report], form: str
+) -> None:
+    """All texts and numbers; HUDDLE_NEW_PICTURES=1 keeps new ones: read the difference."""
+    kept = Path(__file__).parent / f"{form}.txt"
+    xml = PdfReader(issued.certificate()).attachments[NAME][0]
+    lines = lines_of(drawn_up[0]) if form == "pages" else cells_of(etree.fromstring(xml))
+    text = "\n".join(lines) + "\n"
+    for changing, word in CHANGING:
+        text = re.sub(changing, word, text)
+    text = re.sub(r"\d\.\d+e-\d+", lambda found: f"{float(found[0]):.5g}", text)
+    if os.environ.get("HUDDLE_NEW_PICTURES"):
+        kept.write_text(text, encoding="utf-8")
+    assert text.splitlines() == kept.read_text(encoding="utf-8").splitlines()
+
+
+CHANGING = (
+    (r"\b[0-9a-f]{64}\b", "SHA-256"),
+    (r"\b[0-9a-f]{32}\b", "RUN"),
+    (r"PIER-\d{4}", "PIER-YEAR"),
+    (r"(issued |issue: )\d{4}-\d\d-\d\d", r"\1TODAY"),
+    (r"\d\.\d MB", "SIZE"),
+    (re.escape(version("huddle-bench")), "VERSION"),
+)
+"""What differs between two certificates of one recording."""
+
+
+def cells_of(root: etree._Element) -> Iterator[str]:
+    """Yield the text of each element behind its name."""
+    for element in root.iter("{*}*"):
+        if element.text and element.text.strip():
+            yield f"{etree.QName(element).localname}: {element.text}"
 
 
 def test_every_page_has_number_revision_and_count(issued: Laboratory) -> None:

@@ -91,6 +91,23 @@ def texts_of(report: Report) -> list[str]:
     return [" ".join(word.split()) for word in words if word]
 
 
+def lines_of(report: Report) -> list[str]:
+    """Return what is read in a report, a line each: rows of tables are lines."""
+    lines = [report.title, report.subtitle, report.verdict.text]
+    lines += [each.text for each in report.notices]
+    for section in report.sections:
+        lines.append(f"{section.title}:")
+        for part in section.parts:
+            match part:
+                case Table():
+                    lines += [part.title, *map(" | ".join, [part.header, *part.rows])]
+                case KeyValues():
+                    lines += map(" | ".join, part.rows)
+                case _:
+                    lines += words_of(part)
+    return lines
+
+
 def tables(report: Report, section: str) -> list[Table]:
     """Return the tables of a section."""
     (found,) = [each for each in report.sections if each.title.startswith(section)]
