@@ -538,6 +538,22 @@ def ledger_of(recording: Path, about: Bench | None) -> Ledger:
     return Ledger(recording.resolve().parent / table.folder.expanduser())
 
 
+def unknown_beside(folder: Path, entries: Sequence[LedgerEntry]) -> list[str]:
+    """Return which certificates of a folder a ledger of the same numbers lacks, a line each.
+
+    No file of a certificate is older than its row: such a ledger is an older copy, or cut short.
+    """
+    known = {f"{each.number}-r{each.revision}" for each in entries}
+    series = {each.number.rpartition("-")[0] for each in entries}
+    named = (re.fullmatch(r"(.+)-\d+-r\d+", path.stem) for path in folder.glob("*.pdf"))
+    found = sorted(each[0] for each in named if each and each[1] in series)
+    return [
+        f"the ledger lacks {each} of the folder: it is an older copy, or was cut short"
+        for each in found
+        if each not in known
+    ]
+
+
 def ledgers_of(recording: Path, folders: Iterable[Path]) -> list[Ledger]:
     """Return the ledgers that may have a recording.
 

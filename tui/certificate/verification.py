@@ -33,7 +33,7 @@ from daq.recording.signing import problem, signature_of
 from daq.recording.storage.trial import trials
 from tui.certificate.dcc import DCC
 from tui.certificate.dcc import NAME as DCC_NAME
-from tui.certificate.ledger import Ledger, LedgerEntry, ledgers_of
+from tui.certificate.ledger import Ledger, LedgerEntry, ledgers_of, unknown_beside
 from tui.output.extras import require
 from tui.report.certificate import SPECIMEN
 
@@ -107,7 +107,8 @@ def verified(
                 entry, wrong = ledger.certified(path, *own)
                 if entry is not None:
                     names.append(entry.name)
-                    wrong = wrong or "; ".join(_head(ledger, entry, "")[1])
+                    lacking = unknown_beside(ledger.folder, ledger.entries())
+                    wrong = wrong or "; ".join([*_head(ledger, entry, "")[1], *lacking])
                 state = wrong or state
         if state == "intact":
             state = problem(path, *own, public=key) or state
@@ -300,11 +301,7 @@ def _against_ledger(
     named = next((each for each in entries if each.file == path.name), entry)
     if named is not entry:
         wrong.append(f"it is {entry.name}, under the name of {named.name}")
-    later = max(each.revision for each in entries if each.number == entry.number)
-    beside = path.parent.glob(f"{entry.number}-r*.pdf")
-    found = [each.stem.removeprefix(f"{entry.number}-r") for each in beside]
-    if any(each.isdigit() and int(each) > later for each in found):
-        wrong.append("a later revision is in the folder, and not in the ledger: it was cut short")
+    wrong += unknown_beside(path.parent, entries)
     return wrong
 
 

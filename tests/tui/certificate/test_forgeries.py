@@ -73,6 +73,8 @@ def test_what_is_in_a_pdf_takes_no_more_memory_than_it_can_hold(tmp_path: Path) 
     assert peak_of(read) < 300 << 20
 
 
+OLDER = "older.sqlite"
+"""A copy of the ledger, made before its last certificate."""
 SECRET = "secret"  # noqa: S105 - of keys that the tests make
 DROP = "".join(
     f"DROP TRIGGER IF EXISTS {each};"
@@ -108,6 +110,7 @@ def signing(tmp_path_factory: pytest.TempPathFactory) -> Signed:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HUDDLE_PASSPHRASE", SECRET)
         made.issue("--sign", str(private))
+        shutil.copy(made.certificates / NAME, made.folder / OLDER)
         made.issue("--sign", str(private), "--reason", "again")
     return Signed(made, exported(private), other)
 
@@ -238,6 +241,11 @@ def truncated(made: Signed) -> None:
     rewrite(made.lab.certificates, lambda records: records[:2])
 
 
+def rolled_back(made: Signed) -> None:
+    """Put the ledger back to what it was after the first certificate, its signed head included."""
+    shutil.copy(made.lab.folder / OLDER, made.lab.certificates / NAME)
+
+
 def checksums_rewritten(made: Signed) -> None:
     with h5py.File(made.lab.recording, "r+") as file:
         file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
@@ -280,6 +288,7 @@ FORGERIES: dict[Callable[[Signed], None], str] = {
     another_text: "is not intact",
     another_revision: "it is PIER",
     truncated: "is not in the ledger",
+    rolled_back: "is not in the ledger",
     checksums_rewritten: "was changed since the certificate",
     flipped_bit: "its SHA-256 is not that of the ledger",
     another_attachment: "authorised by Mallory",
@@ -316,7 +325,7 @@ def test_who_does_not_know_the_passphrase_issues_nothing(
     ("forge", "words", "trusted"),
     [
         *((forge, words, False) for forge, words in FORGERIES.items()),
-        *((forge, FORGERIES[forge], True) for forge in (unsigned, of_the_same_name, truncated)),
+        *((forge, FORGERIES[forge], True) for forge in (unsigned, of_the_same_name, rolled_back)),
     ],
     ids=lambda each: each.__name__ if callable(each) else None,
 )
@@ -348,13 +357,29 @@ def test_recordings_are_not_certified_by_a_ledger_without_its_signature(
     assert words in said
 
 
-def test_a_ledger_that_was_cut_short_hides_no_revision(forged: Signed) -> None:
-    """The file of the later revision is still there, or its signature is."""
-    truncated(forged)
-    code, said = forged.check(forged.lab.certificate(0), trusted=False)
-    assert code == 3
-    assert "a later revision is in the folder, and not in the ledger" in said
+@pytest.mark.parametrize("forge", [truncated, rolled_back])
+def test_a_ledger_without_its_last_rows_hides_no_certificate_of_its_folder(
+    forged: Signed, forge: Callable[[Signed], None]
+) -> None:
+    """Neither beside an earlier certificate nor of the recording; nor does `issue` go on."""
+    first, lacking = forged.lab.certificate(0), forged.certificate.stem
+    forge(forged)
+    for each in (first, forged.lab.recording):
+        code, said = forged.lab.verify(each)
+        assert code == 3
+        assert f"the ledger lacks {lacking} of the folder" in said
+    again = ["--bench", str(forged.lab.bench), "--despite", "x", "--reason", "y", "--by", "Ada"]
+    refused = CliRunner().invoke(app, ["issue", str(forged.lab.recording), *again])
+    assert refused.exit_code == 2
+    assert "the ledger" in refused.stderr
+
+
+def test_what_an_older_copy_of_a_ledger_proves_is_what_it_proved_then(forged: Signed) -> None:
+    """Without any later certificate, only a truncated ledger lacks its signature."""
     forged.certificate.unlink()
+    rolled_back(forged)
+    assert forged.check(forged.lab.certificate(0), forged.lab.recording)[0] == 0
+    truncated(forged)
     code, said = forged.check(forged.lab.certificate(0))
     assert code == 3
     assert "the ledger is not signed with key" in said
