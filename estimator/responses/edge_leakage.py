@@ -11,7 +11,8 @@ is noise of the channels that differ.
 The responses follow from the averages. A constant real combination of the channels of sensor j
 predicts channel c up to one complex factor, ``D_cj = S_cz / S_yz``, where y is the prediction by j,
 and z that by a third sensor. No channel's noise biases it. Of several third sensors the weighted
-mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any sign and phase.
+mean is taken, with weights ``|S_yz|² / S_zz``: their predictions may have any sign and phase. Some
+third sensors do: their noise counts little beside that of c and y, whose product all j and k have.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ import numpy as np
 from estimator.likelihood.dimension import bands
 from estimator.records import dataclass
 from estimator.self_noise.coherency import BLOCK_BYTES, blocks, check_dims, own_channels
-from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_COHERENCE = 0.3
 """Minimum coherence between a channel and its prediction at a used frequency."""
 _TWO_FREQUENCIES = 1.67  # 2 (1 - 1/6): variance of a difference two bins apart under Hann
 _CORRELATED = 2.0  # variance of a sum over that of independent frequencies
-_MAX_FREQUENCIES = 256  # maximum number of frequencies for the directions
+_MAX_FREQUENCIES = 128  # maximum number of frequencies for the directions
+_MAX_THIRDS = 9  # third sensors: all that predict would cost the cube of their number
 _RIDGE = 1e-9  # fraction of the mean power: keeps matrices regular with a dead direction
 
 
@@ -213,21 +215,25 @@ def channel_responses(
     combined = np.zeros((n_channels, n_sensors, max(dims)))
     for (c, j), direction in directions.items():
         combined[c, j, : len(direction)] = direction
-    i = np.arange(n_sensors)
-    for some in blocks(n_freqs, 2 * n_channels):
+    thirds = np.flatnonzero(combined.any(axis=(0, 2)))
+    thirds = thirds[:: -(-len(thirds) // _MAX_THIRDS) or 1]
+    for some in blocks(n_freqs, n_channels):
         padded = _padded(csm[some], dims)
+        within = np.einsum("fjdje->fjde", padded).real
+        towards = padded[:, :, :, thirds]
         for c in range(n_channels):
             around = combined[c].any(axis=1)
             if np.count_nonzero(around) < 2:
                 continue
-            crossed, among = _predictions(padded, csm[some, c], combined[c], dims)
-            own_power = among[:, i, i].real.copy()
-            among[:, i, i] = 0.0  # the third is another
+            crossed, among = _predictions(towards, csm[some, c], combined[c], dims, thirds)
+            by = combined[c]
+            own_power = (within * (by[:, :, None] * by[:, None])).sum(axis=(2, 3))
+            among[:, thirds, np.arange(len(thirds))] = 0.0  # the third is another
             power = np.maximum(csm[some, c, c].real, 0.0)[:, None]
             with np.errstate(invalid="ignore", divide="ignore"):
-                inverse = np.where(own_power > 0, 1 / own_power, 0.0)
-                sizes = ((among.real**2 + among.imag**2) @ inverse[:, :, None])[:, :, 0]
-                mean = (among.conj() @ (crossed * inverse)[:, :, None])[:, :, 0] / sizes
+                inverse = np.where(own_power > 0, 1 / own_power, 0.0)[:, thirds, None]
+                sizes = ((among.real**2 + among.imag**2) @ inverse)[:, :, 0]
+                mean = (among.conj() @ (crossed[:, thirds, None] * inverse))[:, :, 0] / sizes
                 found = np.abs(crossed) ** 2 / (power * own_power)
             known = usable[some, None] & around & (sizes != 0)
             ratio[some, c] = np.where(known, mean, np.nan)
@@ -251,10 +257,15 @@ def _padded(csm: ComplexArray, dims: tuple[int, ...]) -> ComplexArray:
 
 
 def _predictions(
-    padded: ComplexArray, own: ComplexArray, combined: FloatArray, dims: tuple[int, ...]
+    towards: ComplexArray,
+    own: ComplexArray,
+    combined: FloatArray,
+    dims: tuple[int, ...],
+    thirds: IntArray,
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return cross-spectra of a channel with its predictions, and those of the predictions.
+    """Return cross-spectra of a channel with its predictions, and of these with some of them.
 
+    `towards`, shape (n_freqs, n_sensors, d, n_thirds, d), is `_padded` by the `thirds`.
     Sums over the few channels of a sensor: products of whole matrices would take most terms for
     nothing.
     """
@@ -263,12 +274,12 @@ def _predictions(
         np.cumsum([0, *dims[:-1]]),
         axis=1,
     )
-    rows = padded[:, :, 0] * combined[:, 0, None, None]
+    columns = towards[..., 0] * combined[thirds, 0]
     for more in range(1, combined.shape[1]):
-        rows += padded[:, :, more] * combined[:, more, None, None]
-    among = rows[..., 0] * combined[:, 0]
+        columns += towards[..., more] * combined[thirds, more]
+    among = columns[:, :, 0] * combined[:, 0, None]
     for more in range(1, combined.shape[1]):
-        among += rows[..., more] * combined[:, more]
+        among += columns[:, :, more] * combined[:, more, None]
     return np.asarray(crossed), np.asarray(among)
 
 
@@ -283,7 +294,7 @@ def _directions(
     power = np.einsum("fpp->fp", csm).real
     alive = (power > 0).all(axis=1)
     some = np.flatnonzero(alive)
-    some = some[:: max(1, len(some) // _MAX_FREQUENCIES)]
+    some = some[:: -(-len(some) // _MAX_FREQUENCIES) or 1]
     sensor = np.repeat(np.arange(len(dims)), dims)
     moments = [np.zeros((len(sensor), d, d)) for d in dims]
     seen = np.zeros((len(sensor), len(dims)), np.bool_)

@@ -29,9 +29,9 @@ SNR = 1e5
 FACTOR = 1 / (3 * T**2)
 
 
-def turned(seed: int) -> list[np.ndarray]:
+def turned(seed: int, n_sensors: int = 3) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
-    return [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in DIMS]
+    return [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(n_sensors)]
 
 
 def low_pass(f: np.ndarray) -> np.ndarray:
@@ -39,19 +39,20 @@ def low_pass(f: np.ndarray) -> np.ndarray:
     return np.asarray(1 / (1 + np.sqrt(2) * s + s**2))
 
 
-def exact(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def exact(seed: int = 1, n_sensors: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Return averages without scatter: motion, what leaks of it, noise; and the response of B."""
     response = low_pass(FREQUENCY)
     slope = (low_pass(FREQUENCY + 1e-4) - low_pass(FREQUENCY - 1e-4)) / 2e-4
-    one, other = np.ones((2, 9, 1001), dtype=np.complex128)
+    p = 3 * n_sensors
+    one, other = np.ones((2, p, 1001), dtype=np.complex128)
     one[3:6], other[:] = response, 0.0
     other[3:6] = slope
-    directions = np.vstack(turned(seed))
-    csm = np.zeros((1001, 9, 9), dtype=np.complex128)
+    directions = np.vstack(turned(seed, n_sensors))
+    csm = np.zeros((1001, p, p), dtype=np.complex128)
     for factor, by in ((1.0, one), (FACTOR, other)):
         loading = by.T[:, :, None] * directions
         csm += factor * SNR * loading @ loading.conj().swapaxes(1, 2)
-    return csm + np.eye(9), slope
+    return csm + np.eye(p), slope
 
 
 def test_the_slope_factor_of_a_hann_window_is_that_of_the_integral() -> None:
@@ -64,12 +65,13 @@ def test_a_delay_of_one_sample_under_a_rectangular_window() -> None:
     assert factor * (2 * np.pi / 200) ** 2 * 1e4 == pytest.approx(10.7, rel=0.1)
 
 
-def test_responses_are_found_for_any_orientation() -> None:
-    csm, _ = exact()
-    found = channel_responses(csm, FREQUENCY, dims=DIMS)
+@pytest.mark.parametrize("n_sensors", [3, 12])  # of twelve, not every sensor is a third one
+def test_responses_are_found_for_any_orientation(n_sensors: int) -> None:
+    csm, _ = exact(n_sensors=n_sensors)
+    found = channel_responses(csm, FREQUENCY, dims=(3,) * n_sensors)
     inside = slice(10, 990)
     for channel in (3, 4, 5):
-        for other in (0, 2):
+        for other in (0, *range(2, n_sensors)):
             ratio = found.ratio[inside, channel, other] / found.ratio[200, channel, other]
             expected = low_pass(FREQUENCY)[inside] / low_pass(FREQUENCY[200:201])
             np.testing.assert_allclose(ratio, expected, rtol=2e-3)
