@@ -88,6 +88,34 @@ def test_it_says_which_channel_takes_longest_and_how_far_off_it_may_be() -> None
     assert late.is_close
 
 
+@pytest.mark.parametrize(("n", "seed"), [(3, 1), (3, 2), (4, 3), (9, 5)])
+def test_a_look_at_the_predicted_length_decides_as_likely_as_the_model_says(
+    n: int, seed: int
+) -> None:
+    """Draws of the model of the module: the mean of true margins, these, the later estimate."""
+    rng, cov, draws = np.random.default_rng(seed), 0.12, 40_000
+    margin = rng.normal(0.35, 0.12, n)
+    margins = Margins(margin, like_psd(cov, n), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
+    found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
+    variance = max(0.0, float(margin.var(ddof=1)) - cov**2)
+    mean = margin.mean() + np.sqrt((cov**2 + variance) / n) * rng.standard_normal((draws, 1))
+    trust = variance / (variance + cov**2)
+    truth = trust * margin + (1 - trust) * mean
+    truth = truth + math.sqrt(trust) * cov * rng.standard_normal((draws, n))
+    for seconds, chance in zip(
+        (found.earliest, found.seconds, found.latest), (0.1, LIKELY, 0.9), strict=True
+    ):
+        assert seconds is not None
+        share = 100.0 / seconds
+        later = truth + cov * math.sqrt(share / (1 - share)) * rng.standard_normal((draws, n))
+        low, high = (1 + INTERVAL_FACTOR * (e - 1) for e in margins.ends(share, QUANTILE))
+        then = share * margin + (1 - share) * later
+        passes, fails = then > np.log(high), then < np.log(low)
+        decided = (passes.all(axis=1) | fails.any(axis=1)).mean()
+        # three standard errors of the draws, and 1 % of the five nodes for the mean
+        assert decided == pytest.approx(chance, abs=3 * math.sqrt(0.25 / draws) + 0.01)
+
+
 @pytest.mark.long
 def test_it_decides_as_often_as_it_says() -> None:
     """Channels of different noise, each estimated with scatter, now and after the time stated."""
