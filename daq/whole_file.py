@@ -93,7 +93,7 @@ def remove(part: Path) -> None:
         if part.is_dir():
             shutil.rmtree(part)
         else:
-            part.unlink(missing_ok=True)
+            part.unlink()
 
 
 def remove_parts(folder: Path, name: str, *, age: float = 0.0) -> None:

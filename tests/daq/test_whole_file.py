@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import os
 import stat
 from pathlib import Path
@@ -27,13 +29,13 @@ def names_in(folder: Path) -> list[str]:
 def test_a_file_replaces_an_earlier_one_and_keeps_its_permissions(tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     write_whole(path, b"one")
-    path.chmod(0o640)
+    path.chmod(0o666)  # more than the process gives to new files
     link = tmp_path / "link"
     link.symlink_to(path)
     write_whole(link, b"two")
     assert link.is_symlink()
     assert path.read_bytes() == b"two"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666
     assert names_in(tmp_path) == ["link", "r.json"]
 
 
@@ -52,6 +54,28 @@ def test_a_file_is_synced_before_it_replaces_another_and_its_folder_after(
     assert synced == [(False, b"one"), (True, b"two")]
 
 
+@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize(
+    ("code", "is_refused"), [(errno.EIO, True), (errno.EINVAL, False), (errno.EACCES, False)]
+)
+def test_a_folder_that_cannot_be_synced_is_an_error_where_the_disk_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, code: int, is_refused: bool, free: bool
+) -> None:
+    """Not where a file system cannot sync folders; a name that was to be free is free again."""
+    sync = os.fsync
+
+    def fails(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(code, "of the test")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fails)
+    path = tmp_path / "r.json"
+    with pytest.raises(OSError, match="of the test") if is_refused else contextlib.nullcontext():
+        write_whole(path, b"one", free=free)
+    assert names_in(tmp_path) == ([] if is_refused and free else ["r.json"])
+
+
 def test_a_file_that_the_disk_refuses_leaves_the_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     write_whole(path, b"one")
@@ -62,13 +86,26 @@ def test_a_file_that_the_disk_refuses_leaves_the_earlier_one(tmp_path: Path) -> 
     assert names_in(tmp_path) == ["r.json"]
 
 
-def test_a_name_that_must_be_free_is_not_replaced(tmp_path: Path) -> None:
+def test_a_name_that_must_be_free_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "key"
     write_whole(path, b"one", mode=0o600, free=True)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     with pytest.raises(FileExistsError):
         write_whole(path, b"two", free=True)
     assert path.read_bytes() == b"one"
+
+    def refused(*_: Path) -> None:
+        raise OSError(errno.EPERM, "no hard links here")
+
+    monkeypatch.setattr(os, "link", refused)
+    write_whole(tmp_path / "other", b"two", free=True)
+    assert (tmp_path / "other").read_bytes() == b"two"
+    with pytest.raises(FileExistsError):
+        write_whole(path, b"two", free=True)
+    assert path.read_bytes() == b"one"
+    assert names_in(tmp_path) == ["key", "other"]
 
 
 def test_other_bytes_on_the_disk_are_refused(tmp_path: Path) -> None:
@@ -95,10 +132,25 @@ def test_leftovers_of_killed_processes_are_removed_after_a_day(tmp_path: Path) -
 
 
 def test_a_write_that_fails_once_is_remembered(tmp_path: Path) -> None:
+    """HDF5 goes on with what it has written, as if the disk had it."""
     with RememberingFile(tmp_path / "f", "x+") as file:
+        file.truncate(70)
+        file.write(b"a" * 60)
+        assert os.fstat(file.fileno()).st_size == 70
         with files_limited_to(100):
-            assert file.write(bytes(1000)) == 1000
+            assert file.write(b"b" * 1000) == 1000
+        assert file.tell() == 1060
+        assert file.truncate(5) == 5
         file.write(b"later")
+        assert file.seek(0, io.SEEK_END) == 1065
+        for at, expected in (
+            (1055, b"b" * 5 + b"later" + bytes(10)), (55, b"a" * 5 + b"b" * 5), (50, b"a" * 10)
+        ):  # fmt: skip
+            buffer = bytearray(len(expected))
+            file.seek(at - 1065, io.SEEK_END)
+            assert file.readinto(buffer) == len(expected)
+            assert buffer == expected
+            assert file.tell() == at + len(expected)
         with pytest.raises(OSError, match="File too large"):
             file.check()
     assert (tmp_path / "f").stat().st_size <= 100

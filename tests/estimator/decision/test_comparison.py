@@ -117,6 +117,12 @@ def test_an_uncertain_sensitivity_takes_time_by_squares_and_no_time_decides_besi
         assert ahead is not None
         assert ahead.seconds is not None
         times.append(ahead.seconds)
+    bound = 0.4 * whole  # what may have been added, or removed, takes its part of the margin first
+    beside = replace(found, reach=0.3 * whole)
+    beside = replace(beside, outer_low=found.low - math.expm1(bound))
+    beside = replace(beside, outer_high=found.high + math.expm1(bound))
+    expected = bound + whole * math.sqrt(0.6**2 - 0.3**2)
+    np.testing.assert_allclose(np.abs(beside.margins().margin), expected)
     assert times == sorted(times)
     assert times[2] > 2 * times[0]
     never = comparison(0.5, 1.2, reach=2 * whole, **noise)

@@ -88,7 +88,7 @@ def test_it_says_which_channel_takes_longest_and_how_far_off_it_may_be() -> None
     assert late.is_close
 
 
-@pytest.mark.parametrize(("n", "seed"), [(3, 1), (3, 2), (4, 3), (9, 5)])
+@pytest.mark.parametrize(("n", "seed"), [(1, 1), (2, 4), (3, 2), (4, 3), (9, 5)])
 def test_a_look_at_the_predicted_length_decides_as_likely_as_the_model_says(
     n: int, seed: int
 ) -> None:
@@ -97,9 +97,12 @@ def test_a_look_at_the_predicted_length_decides_as_likely_as_the_model_says(
     margin = rng.normal(0.35, 0.12, n)
     margins = Margins(margin, like_psd(cov, n), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
     found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
-    variance = max(0.0, float(margin.var(ddof=1)) - cov**2)
-    mean = margin.mean() + np.sqrt((cov**2 + variance) / n) * rng.standard_normal((draws, 1))
-    trust = variance / (variance + cov**2)
+    mean, trust = margin, 1.0  # of one margin, nothing else is known
+    if n > 1:
+        variance = max(0.0, float(margin.var(ddof=1)) - cov**2)
+        error = math.sqrt((cov**2 + variance) / n)
+        mean = margin.mean() + error * rng.standard_normal((draws, 1))
+        trust = variance / (variance + cov**2)
     truth = trust * margin + (1 - trust) * mean
     truth = truth + math.sqrt(trust) * cov * rng.standard_normal((draws, n))
     for seconds, chance in zip(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimator.levels.bands import band_levels
-from estimator.levels.pooled import blocks_of
+from estimator.levels.pooled import LEAST_BINS, blocks_of
 from estimator.methods import self_noise
 from estimator.types import ComplexArray
 
@@ -40,6 +40,22 @@ def test_neighbours_count_rightly_where_levels_fall_within_a_block(steep: str) -
     found_over_true, covered = (np.array(each) for each in zip(*means, strict=True))
     np.testing.assert_allclose(np.median(found_over_true, axis=(0, 2)), 1.0, atol=0.08)
     assert covered.mean() > 0.9
+
+
+def test_blocks_are_thirds_of_an_octave_with_bins_enough() -> None:
+    """The last one takes what is left, if that is less than a block."""
+    frequency = 0.1 * np.arange(1200, dtype=np.float64)
+    block = blocks_of(frequency)
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    sizes = np.diff(first, append=len(block))
+    assert set(np.diff(block).tolist()) == {0, 1}
+    assert sizes.min() == sizes[0] == LEAST_BINS
+    ends = frequency[first[:-1]] * 2 ** (1 / 3)
+    assert (frequency[first[1:]] >= ends).all()
+    wide = sizes[:-1] > LEAST_BINS
+    assert wide.any()
+    assert (frequency[first[1:] - 1] < ends)[wide].all()
+    assert sizes[-1] < 2 * sizes[-2]
 
 
 def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
