@@ -139,15 +139,16 @@ class Levels:
         Returns
         -------
         low, high : float64, shape (n_bands, n_channels)
-            No upper end is above that of the bound. Where the whole interval is, the estimate is
-            withdrawn: the lower end is then minus infinity.
+            No upper end is above that of the bound. Where the whole interval is, or none of it is
+            above zero, the estimate is withdrawn: the lower end is then minus infinity, and the
+            upper one that of the bound.
         """
         low, high = widened(
             *self.of_scatter.interval(quantile), self.contributions, without=without
         )
         most = self._most(quantile)
-        low = np.where(low > most, -np.inf, low)
-        high = np.where(np.isnan(high), high, np.fmin(high, most))
+        low = np.where((low > most) | (high < 0), -np.inf, low)
+        high = np.where(np.isnan(high), high, np.where(high < 0, most, np.fmin(high, most)))
         if not factor:
             return low, high
         reach = quantile * deviation(self.contributions, without=without)
@@ -162,9 +163,9 @@ class Levels:
         return np.broadcast_to(deviation(self.contributions), self.mean.shape[1:])
 
     def withdrawn(self, quantile: float = NORMAL_95) -> BoolArray:
-        """Whether the whole interval is above the bound: the model has too few dimensions."""
-        low, _ = widened(*self.of_scatter.interval(quantile), self.contributions)
-        return np.asarray(low > self._most(quantile))
+        """Whether the interval is above the bound or below zero: the model lacks dimensions."""
+        low, high = widened(*self.of_scatter.interval(quantile), self.contributions)
+        return np.asarray((low > self._most(quantile)) | (high < 0))
 
     def of_channel(
         self, column: int, quantile: float = NORMAL_95, *, without: Collection[Source] = ()

@@ -1,4 +1,4 @@
-"""Levels above what the other sensors leave unpredicted are withdrawn."""
+"""Levels above what the other sensors leave unpredicted, or below zero, are withdrawn."""
 
 from __future__ import annotations
 
@@ -34,6 +34,20 @@ def test_a_withdrawn_level_has_no_lower_end() -> None:
     assert found.withdrawn().all()
     assert np.isneginf(low).all()
     assert (high < 0.1 * found.mean).all()
+
+
+def test_an_interval_below_zero_is_withdrawn() -> None:
+    """Motion across the axes leaves less than nothing: "below 0" was said of 43 dB."""
+    found = bounded_by(0.5)
+    found = replace(found, of_scatter=replace(found.of_scatter, mean=-found.mean))
+    assert (found.of_scatter.interval()[1] < 0).all()  # what this is about
+    low, high = found.ends()
+    assert found.withdrawn().all()
+    assert np.isneginf(low).all()
+    assert (high > found.bound.mean).all()
+    unknown = np.full_like(found.bound.mean, np.nan)
+    _, high = replace(found, bound=replace(found.bound, mean=unknown)).ends()
+    assert np.isposinf(high).all()
 
 
 def test_a_level_below_its_bound_keeps_its_ends() -> None:
