@@ -10,12 +10,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
 import huddle
 from daq.bench.estimate_settings import table_keys
+from daq.recording.reader import Recording
+from daq.recording.sensor_record import _NEWEST_ROWS
+from tests.daq.clocks.recordings import write_polled
 from tests.full_disk import files_limited_to
 from tests.tui.night_recording import HOSTILE, record
 from tests.tui.thinned import thinned
@@ -69,6 +73,17 @@ def estimated(recording: Path, *options: str) -> dict[str, Any]:
 def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     recording = record(tmp_path_factory.mktemp("document") / "night.h5")
     return Written(recording, estimated(recording, "--noise-parameters"))
+
+
+def test_a_recording_of_many_blocks_is_described(tmp_path: Path) -> None:
+    """Old blocks are in its file only, which must be open: JSON after 3 h at 200 Hz failed."""
+    lost = {name: np.zeros(4400, np.bool_) for name in "abc"}
+    path = write_polled(tmp_path / "long.h5", lost, rate=4.0)
+    with Recording.open(path) as recording:
+        assert all(len(each.blocks) > 2 * _NEWEST_ROWS for each in recording.sensors)
+    found = estimated(path, "--segment", "20s")
+    Draft202012Validator(strict(SCHEMA)).validate(found)
+    assert found["recordings"][0]["sensors"]
 
 
 def test_the_schema_is_one_itself() -> None:
