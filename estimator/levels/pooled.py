@@ -34,15 +34,19 @@ import numpy as np
 
 from estimator.levels.interval import moved, worth
 from estimator.levels.noise_matrices import (
+    WHOLE,
     are_many,
     axes_of,
     inverse,
+    inverse_of_sensors,
+    leading,
     mean_coupling,
     pairs,
     times,
     traces,
     weights_beside,
     white,
+    without,
 )
 from estimator.median import median
 from estimator.records import dataclass
@@ -279,10 +283,10 @@ def _pool(
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
     parts, mean = cut(at, largest)
-    at = at[_n_resolved(white(mean, whitener[parts.block]), parts, q, sensor) > 0]
+    at = at[_n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor) > 0]
     while len(at):
         parts, mean = cut(at, k[at])
-        r = _n_resolved(white(mean, whitener[at][parts.block]), parts, q[at], sensor)
+        r = _n_resolved(white(mean, whitener[at][parts.block], sensor), parts, q[at], sensor)
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
@@ -349,20 +353,21 @@ def _fitted(
     at_most = np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
     for turn in range(ROUNDS):
-        X = white(mean, whitener[own])
+        X = white(mean, whitener[own], sensor)
         U = np.zeros((len(own), p, 0), np.complex128)
         P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
         g = np.ones(len(own))
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
-            U = _leading(np.linalg.eigh(X)[1], r[own])
+            U = _leading(_axes(X, int(r.max())), r[own])
             P = P - U @ U.conj().swapaxes(1, 2)
             source = _nearest(P, parts, sensor)
             P, U = P[source], U[source]
             # directions take noise of the samples they are from, and let motion of others pass
             g = N / np.where(source == np.arange(len(own)), N - r[own], N + r[own])
-        T = parts.mean(g[:, None, None] * (P @ X @ P)) if resolve else X
-        A = np.linalg.eigh(T)[1]
+        rest = without(X, U)
+        T = parts.mean(g[:, None, None] * rest) if resolve else X
+        A = _axes(T, int((at_most - r).max()))
         kept = parts.mean(P)
         q = r + _shown(T, A, kept, resolved=r, wanted=at_most, averages=whole, sensor=sensor)
         weak = q - r
@@ -374,8 +379,8 @@ def _fitted(
             gram += unused[:, :, None] * np.eye(gram.shape[1])
             PA = PA @ np.linalg.inv(np.linalg.cholesky(gram)).conj().swapaxes(1, 2)
             Q, U = P - PA @ PA.conj().swapaxes(1, 2), np.concatenate([U, PA], axis=2)
+            rest = without(X, U)
         loss = 1 + weak / np.maximum(whole - q, 1.0)
-        rest = Q @ X @ Q
         y = g[:, None] * rest[:, a, b]
         noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
         kept = parts.mean(np.einsum("bii->bi", Q).real)
@@ -412,7 +417,7 @@ def _start(mean: ComplexArray, parts: _Parts, sensor: IntArray) -> ComplexArray:
     p, N = mean.shape[1], parts.averages
     power = np.einsum("bii->bi", mean).real
     inverted = np.linalg.inv(mean + _SINGULAR * power[:, :, None] * np.eye(p))
-    alone = np.linalg.inv(np.where(sensor[:, None] == sensor, inverted, 0))
+    alone = inverse_of_sensors(inverted, sensor)
     alone *= (N / (N - p * (1 - 1 / (sensor[-1] + 1))))[:, None, None]
     start = parts.mean((alone + alone.conj().swapaxes(1, 2)) / 2)
     singular = np.linalg.eigvalsh(start)[:, 0] <= 0
@@ -459,7 +464,7 @@ def _read(
     elif parts.count.max() == 1:
         noise = fit.gain[:, None] * times(weight, fit.white[:, a, b]).real
     else:
-        X = white(matrix[parts.bins], fit.whitener[parts.block][at])
+        X = white(matrix[parts.bins], fit.whitener[parts.block][at], sensor)
         y = (Q[at] @ X @ Q[at])[:, a, b]
         noise = fit.gain[at, None] * times(weight[at], y).real
     traces = _traces(weight, fit.white * fit.gain[:, None, None], sensor)
@@ -469,6 +474,19 @@ def _read(
     use = wanted[parts.block][at]
     found.noise[parts.bins[use]] = noise[use]
     found.cumulants[:, parts.bins[use]] = cumulants[:, use]
+
+
+def _axes(X: ComplexArray, most: int) -> ComplexArray:
+    """Return eigenvectors of the largest eigenvalues, ascending, shape (n, p, most)."""
+    p = X.shape[1]
+    axes = np.empty((len(X), p, most), np.complex128)
+    poor = np.ones(len(X), np.bool_)
+    if p > WHOLE:
+        _, found, good = leading(X, most)
+        axes[:], poor = found[:, :, ::-1], ~good
+    if poor.any() and most:
+        axes[poor] = np.linalg.eigh(X[poor])[1][:, :, p - most :]
+    return axes
 
 
 def _leading(axes: ComplexArray, number: IntArray) -> ComplexArray:
@@ -554,11 +572,19 @@ class _Bounds:
 
     @classmethod
     def of(cls, X: ComplexArray, most: int) -> _Bounds:
-        """Return bounds of the leading eigenvalues of matrices, (n_blocks, n_sampled, p, p)."""
-        w, u = np.linalg.eigh(X)
-        values = np.asarray(w[:, :, ::-1][:, :, : most + 1], np.float64)
+        """Return bounds of the leading eigenvalues of matrices, (n_blocks, n_sampled, p, p).
+
+        The largest one of those that follow is below the fourth root of their fourth powers' sum.
+        """
+        flat = X.reshape(-1, *X.shape[2:])
+        U = _axes(flat, most)[:, :, ::-1]
+        rest = without(flat, U)
+        values = np.empty((len(flat), most + 1))
+        values[:, :most] = (U.conj() * (flat @ U)).real.sum(axis=1)
+        values[:, most] = np.sqrt(np.linalg.norm(rest @ rest, axis=(1, 2)))
+        values = values.reshape(*X.shape[:2], most + 1)
         return cls(
-            values[:, :, :most], u[:, :, :, ::-1][:, :, :, :most], median(values.swapaxes(0, 1))
+            values[:, :, :most], U.reshape(*X.shape[:3], most), median(values.swapaxes(0, 1))
         )
 
     def surely_stand(
@@ -597,15 +623,15 @@ def _shown(
     apart = sensor[:, None] != sensor
     found = wanted - resolved
     open_ = np.ones(n, np.bool_)
-    rest, without = T, projector
+    rest, kept = T, projector
     for number in range(int(found.max(initial=0))):
         if number:
             u = axes[:, :, -number, None]
             off = np.eye(p) - u @ u.conj().swapaxes(1, 2)
-            rest, without = off @ rest @ off, off @ without @ off
+            rest, kept = off @ rest @ off, off @ kept @ off
         # each sensor by itself as without motion, whatever its noise was taken for
-        alike = _power(without, apart, 0.5) @ _power(rest, apart, -0.5)
-        error = np.abs(white(rest, alike) - without) ** 2
+        alike = _power(kept, apart, 0.5) @ _power(rest, apart, -0.5)
+        error = np.abs(white(rest, alike, sensor) - kept) ** 2
         degrees = _degrees(sensor, resolved + number)
         statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
         fits = statistic < degrees + SHOWN * np.sqrt(2 * degrees)

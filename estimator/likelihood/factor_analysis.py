@@ -27,14 +27,12 @@ from typing import Any
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
-from estimator.levels.noise_matrices import axes_of, coupling_beside, pairs
+from estimator.levels.noise_matrices import WHOLE, axes_of, coupling_beside, leading, pairs
 from estimator.self_noise.coherency import TOLERANCE, blocks
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-_FEW = 16  # channels whose matrices are diagonalised whole
 _NEARLY_ONE = 1e-4  # share of a channel beside the factors, near zero noise
 _SAFE = 1e-9  # least eigenvalue of a coherency that inverts without doubt
-_BESIDE, _ROUNDS, _ROUNDING = 3, 4, 1e-11  # of subspace iteration
 _LEAST = 0.05  # of the noise in any direction, over that before the step
 _DAMPING, _DAMPED, _MOST = 1e-3, 10.0, 1e6  # of steps that gain nothing: first, more, last
 _FALLING = 0.1  # of the noise at first: from there directions are tried at zero
@@ -389,7 +387,7 @@ def _inverted(matrices: ComplexArray) -> tuple[FloatArray, ComplexArray]:
     bounds its eigenvalues.
     """
     p = matrices.shape[1]
-    if p > _FEW:
+    if p > WHOLE:
         with suppress(np.linalg.LinAlgError):
             np.linalg.cholesky(matrices)
             found: ComplexArray = np.asarray(np.linalg.inv(matrices), np.complex128)
@@ -666,7 +664,7 @@ class _Given:
     def __init__(self, matrix: ComplexArray, precision: ComplexArray, sensor: IntArray) -> None:
         self.matrix, self.precision = matrix, precision
         self._sensor, self._within = sensor, sensor[:, None] == sensor
-        self._log_determinant = np.linalg.slogdet(matrix)[1] if matrix.shape[1] > _FEW else None
+        self._log_determinant = np.linalg.slogdet(matrix)[1] if matrix.shape[1] > WHOLE else None
 
     def start(self, *, with_motion: bool) -> ComplexArray:
         """Return a root of the noise to begin with: what other sensors do not predict."""
@@ -717,50 +715,6 @@ class _Given:
 
 def _rows(matrices: ComplexArray, rows: IntArray) -> ComplexArray:
     return matrices if len(rows) == len(matrices) else matrices[rows]
-
-
-def leading(
-    matrices: ComplexArray, q: int, guess: ComplexArray | None = None
-) -> tuple[FloatArray, ComplexArray, BoolArray]:
-    """Return the largest eigenvalues of Hermitian matrices by subspace iteration.
-
-    A tenth of the time of all eigenvalues, for 48 channels with strong motion of three dimensions.
-
-    Parameters
-    ----------
-    matrices : complex128, shape (n, p, p)
-        Positive definite.
-    q : int
-    guess : complex128, shape (n, p, q), optional
-        Directions to begin with.
-
-    Returns
-    -------
-    eigenvalues : float64, shape (n, q)
-        Descending.
-    eigenvectors : complex128, shape (n, p, q)
-    good : bool, shape (n,)
-        Whether they are known to rounding: not if further eigenvalues are nearly as large.
-    """
-    n, p = matrices.shape[:2]
-    if not q:
-        return np.empty((n, 0)), np.empty((n, p, 0), np.complex128), np.ones(n, np.bool_)
-    more = min(q + _BESIDE, p) - (0 if guess is None else q)
-    turns = np.exp(1j * np.outer(np.arange(p), 1 + np.arange(more)) ** 2)  # in no order
-    begin = np.broadcast_to(turns, (n, p, more))
-    basis = begin if guess is None else np.concatenate([guess, begin], axis=2)
-    for _ in range(_ROUNDS):
-        basis = np.linalg.qr(matrices @ basis)[0]
-        image = matrices @ basis
-        inner = basis.conj().swapaxes(1, 2) @ image
-        w, turn = np.linalg.eigh((inner + inner.conj().swapaxes(1, 2)) / 2)
-        w, turn = w[:, ::-1], turn[:, :, ::-1]
-        u, basis = basis @ turn[:, :, :q], image @ turn
-        error = np.abs(basis[:, :, :q] - u * w[:, None, :q]).max(axis=(1, 2))
-        good = error < _ROUNDING * (1 + 1e-3 * w[:, 0])
-        if good.all():
-            break
-    return w[:, :q], u, good
 
 
 def _scaled(at: FitPoint) -> FitPoint:

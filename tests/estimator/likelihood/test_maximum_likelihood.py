@@ -430,7 +430,7 @@ def test_many_channels_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) ->
         ]
     )
     found = maximise(draws, 2)
-    monkeypatch.setattr(factor_analysis, "_FEW", 18)
+    monkeypatch.setattr(factor_analysis, "WHOLE", 18)
     whole = maximise(draws, 2)
     np.testing.assert_allclose(found.psi, whole.psi, rtol=1e-6)
     np.testing.assert_allclose(found.discrepancy, whole.discrepancy, rtol=1e-6)
