@@ -123,6 +123,8 @@ class DimensionsChosen(Fact):
             lines.append(f"{where} the motion has all {self.usual} dimensions.")
         if not self.choices:
             return Words(lines[0].rstrip("."), lines[0])
+        if any(choice.n_factors > choice.usual for choice in self.choices):
+            lines.append("Assumed: no noise that all sensors share.")  # it is like such a dimension
         found = sorted({choice.n_factors for choice in self.choices})
         numbers = f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
         bands = _bands([(choice.low, choice.high) for choice in self.choices])

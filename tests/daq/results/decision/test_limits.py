@@ -266,6 +266,9 @@ def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> N
     assert verdict_on(wrong, 1e-14).verdict is Verdict.FAIL
 
 
+CHOSEN = "dimensions-chosen"
+
+
 def with_further_dimensions(cov: float, *, accepted: bool) -> Snapshot:
     """Five dimensions from 1 to 10 Hz, and what maximum likelihood makes of one motion."""
     snapshot = made_snapshot(n_effective=1000.0)
@@ -292,6 +295,8 @@ def with_further_dimensions(cov: float, *, accepted: bool) -> Snapshot:
 def test_the_error_of_further_dimensions_is_not_averaged_away() -> None:
     settings = replace(SETTINGS, methods=("maximum-likelihood",))
     plain, wide = (with_further_dimensions(cov, accepted=True) for cov in (0.0, 0.2))
+    (said,) = (str(each) for each in Result(plain, settings).facts if each.name == CHOSEN)
+    assert said.endswith("no noise that all sensors share.")  # it is like such a dimension
     noise = plain.results["maximum-likelihood"]
     for band, share in (((1.0, 10.0), 0.1), ((20.0, 30.0), 0.0)):  # 2.5 times 0.2 squared
         (old, *_), (new, *_) = (
