@@ -16,15 +16,33 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from daq.results.sources import sources
+from tests.tui.example_snapshot import SETTINGS, demo_bench, diagnosed
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
-from tests.tui.report.written_report import Reported, Words, by_channel, tables, texts_of
+from tests.tui.report.written_report import (
+    Reported,
+    Words,
+    assert_as_kept,
+    by_channel,
+    lines_of,
+    tables,
+    texts_of,
+)
 from tui.commands.main import app
 from tui.output.json_document import result_document
 from tui.page.blocks import Plot, Section
 from tui.page.table import Cell, Table, tone_of
+from tui.report.certificate import notices, watermark
 from tui.report.contents import by_sensor, report_of
-from tui.report.evidence import facts_section
+from tui.report.evidence import (
+    alignment_section,
+    clocks_section,
+    facts_section,
+    model_test_section,
+)
 from tui.report.figures.drift import without_line
+from tui.report.noise import noise_section
+from tui.report.parameters import parameters_section
+from tui.report.uncertainty import uncertainty_section
 
 
 def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) -> None:
@@ -104,6 +122,30 @@ def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
     assert "by the three-sensor method" in table.title
     assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
     assert report.verdict.text == reported.report.verdict.text
+
+
+@pytest.mark.parametrize("share", [0.0004, 0.3])
+def test_all_cells_of_two_methods_and_free_clocks_are_as_kept(share: float) -> None:
+    made = diagnosed(n_effective=100.0)
+    known = replace(made.diagnostics.synchronisation, noise_bias=np.full((201, 9), share))
+    diagnostics = replace(made.diagnostics, synchronisation=known)
+    result = Result(replace(made, diagnostics=diagnostics), SETTINGS)
+    sections = (
+        noise_section(result), uncertainty_section(result, demo_bench()),
+        parameters_section(result), model_test_section(result), alignment_section(result),
+        clocks_section(result),
+    )  # fmt: skip
+    kept = Path(__file__).parent / f"free_clocks_{share}.txt"
+    assert_as_kept(lines_of(filter(None, sections)), kept)
+
+
+def test_one_simulated_recording_makes_the_report_one_of_a_model(reported: Reported) -> None:
+    (real,) = sources([reported.recording])
+    assert watermark([real], None) == "DRAFT"
+    both = [real, replace(real, simulated=True)]
+    assert watermark(both, None) == "SIMULATED"
+    first, *_ = notices(both, reported.result, None, None)
+    assert first.text.startswith("SIMULATED SENSORS")
 
 
 def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:

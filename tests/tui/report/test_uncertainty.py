@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from daq.bench.model import DataSheet
 from daq.recording.reader import Recording
@@ -87,12 +88,28 @@ def test_the_range_reaches_from_the_noise_to_a_sine_of_full_scale(reported: Repo
     with Recording.open(reported.recording) as recording:
         bench = recording.bench
     assert bench is not None
-    sheet = DataSheet(full_scale=2.0, unit="g")
-    first = bench.sensors[0].model_copy(update={"data_sheet": sheet})
-    about = bench.model_copy(update={"sensors": (first, *bench.sensors[1:])})
-    section = uncertainty_section(Result(reported.snapshot, reported.settings), about)
+    first = bench.sensors[0]
+    about = {
+        unit: bench.model_copy(
+            update={
+                "sensors": (
+                    first.model_copy(update={"data_sheet": DataSheet(full_scale=2.0, unit=unit)}),
+                    *bench.sensors[1:],
+                )
+            }
+        )
+        for unit in ("g", "m/s")
+    }
+    result = Result(reported.snapshot, reported.settings)
+    other = uncertainty_section(result, about["m/s"])
+    assert other is not None
+    assert not any(isinstance(part, Plot) for part in other.parts)  # no acceleration
+    section = uncertainty_section(result, about["g"])
     assert section is not None
-    assert any(isinstance(part, Plot) for part in section.parts)
+    (plot,) = (part for part in section.parts if isinstance(part, Plot) and part.title)
+    axes = Figure().subplots()
+    plot.panels[0](axes)
+    assert axes.get_ylabel() == "dB re 1 m/s² rms"
     rms, reach = [part for part in section.parts if isinstance(part, Table)][1:3]
     column = rms.header.index("A.X")
     for noise, range_db in zip(rms.rows, reach.rows, strict=True):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from html.parser import HTMLParser
@@ -12,7 +15,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
 from daq.results.sources import sources
-from tui.page.blocks import Items, KeyValues, Paragraph, Part, Plot, Report
+from tui.page.blocks import Items, KeyValues, Paragraph, Part, Plot, Report, Section
 from tui.page.html_page import page
 from tui.page.pdf import write_paper
 from tui.page.table import Table
@@ -91,11 +94,18 @@ def texts_of(report: Report) -> list[str]:
     return [" ".join(word.split()) for word in words if word]
 
 
-def lines_of(report: Report) -> list[str]:
-    """Return what is read in a report, a line each: rows of tables are lines."""
-    lines = [report.title, report.subtitle, report.verdict.text]
-    lines += [each.text for each in report.notices]
-    for section in report.sections:
+def assert_as_kept(lines: Iterable[str], kept: Path) -> None:
+    """Compare all texts and numbers; HUDDLE_NEW_PICTURES=1 keeps new ones: read the difference."""
+    text = re.sub(r"\d\.\d+e-\d+", lambda found: f"{float(found[0]):.5g}", "\n".join(lines) + "\n")
+    if os.environ.get("HUDDLE_NEW_PICTURES"):
+        kept.write_text(text, encoding="utf-8")
+    assert text.splitlines() == kept.read_text(encoding="utf-8").splitlines()
+
+
+def lines_of(sections: Iterable[Section]) -> list[str]:
+    """Return what is read in sections, a line each: rows of tables are lines."""
+    lines = []
+    for section in sections:
         lines.append(f"{section.title}:")
         for part in section.parts:
             match part:
