@@ -98,7 +98,9 @@ class Comparison:
             return Judged(Verdict.FAIL, int(above.argmax()))
         highest = np.where(known, self.outer_high / self.mask, -math.inf)
         worst = int(highest.argmax())
-        if trusted.all() and highest.max() <= 1 and self.outer_high.min() > 0:
+        withdrawn = self.is_withdrawn & (self.high < 0)  # the upper end is a bound then
+        is_positive = self.outer_high.min() > 0 and not withdrawn.any()
+        if trusted.all() and highest.max() <= 1 and is_positive:
             return Judged(Verdict.PASS, worst)
         return Judged(Verdict.NOT_DECIDED, worst, self._obstacle(known, trusted))
 
