@@ -19,7 +19,7 @@ from estimator.likelihood import goodness_of_fit
 from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, n_noise
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
-from estimator.likelihood.shared_by_two import SHARING, PairSearch, local_shares
+from estimator.likelihood.shared_by_two import SHARING, PairSearch
 from estimator.median import median
 from estimator.records import Hertz, dataclass
 from estimator.self_noise.coherency import (
@@ -351,7 +351,7 @@ def choose_dimension(
             break
     sharers = PairSearch(
         lambda q, b, group: search.sensor_test(q, b, group, r),
-        search.local,
+        search.axes,
         dims=there.dims,
         usual=usual,
         level=level,
@@ -441,7 +441,7 @@ class _Search:
         stride: dict[int, int],
     ) -> None:
         self._maxima, self._dims, self._stride = maxima, dims, stride
-        self.local: dict[int, FloatArray] = {}
+        self.axes: dict[int, ComplexArray] = {}
         self._matrix = matrix
         self._psd = psd
         self._number = number
@@ -470,8 +470,7 @@ class _Search:
             )
         if q <= self._usual + 1:
             for b in some:
-                here = maximum.eigenvectors[self._number[rows] == b]
-                self.local[b] = local_shares(here, self._dims)
+                self.axes[b] = maximum.eigenvectors[self._number[rows] == b]
         error = standard_error(maximum, n_effective=self._n_effective)
         return _Fit(
             number=self._number[rows],

@@ -49,10 +49,11 @@ def local_shares(axes: ComplexArray, dims: tuple[int, ...]) -> FloatArray:
     Mean over frequencies of the largest share of any direction, by orthonormal `axes`.
     """
     own = np.split(np.arange(axes.shape[1]), np.cumsum(dims)[:-1])
-    power = [axes[:, at].conj().swapaxes(1, 2) @ axes[:, at] for at in own]
+    power = np.stack([axes[:, at].conj().swapaxes(1, 2) @ axes[:, at] for at in own])
     found = np.zeros((len(dims), len(dims)))
-    for i, j in combinations(range(len(dims)), 2) if axes.size else ():
-        found[i, j] = np.linalg.eigvalsh(power[i] + power[j])[:, -1].mean()
+    if axes.size:
+        i, j = np.triu_indices(len(dims), 1)
+        found[i, j] = np.linalg.eigvalsh(power[i] + power[j])[:, :, -1].mean(axis=1)
     return found
 
 
@@ -110,8 +111,8 @@ class PairSearch:
     Parameters
     ----------
     test : callable
-    local : mapping of int to float64, shape (n_sensors, n_sensors)
-        `local_shares` of each band.
+    axes : mapping of int to complex128, shape (n_rows, n_channels, n_factors)
+        Directions of the motion in each band.
     dims : tuple of int
         Channels of each sensor.
     usual : int
@@ -123,13 +124,13 @@ class PairSearch:
     def __init__(
         self,
         test: Test,
-        local: Mapping[int, FloatArray],
+        axes: Mapping[int, ComplexArray],
         *,
         dims: tuple[int, ...],
         usual: int,
         level: float,
     ) -> None:
-        self._test, self._local, self._dims = test, local, dims
+        self._test, self._axes, self._dims = test, axes, dims
         self._usual, self._level = usual, level
         self._alone = np.arange(len(dims))
 
@@ -158,7 +159,7 @@ class PairSearch:
         One more dimension explains it as well, or none does: then `any_pair` of four sensors is
         tried, whose dimensions beyond the motion show no share.
         """
-        share = self._local[band]
+        share = local_shares(self._axes[band], self._dims)
         every = sorted(combinations(self._alone.tolist(), 2), key=lambda pair: -share[pair])
         likely = [each for each in every if share[each] > LOCAL][:CANDIDATES]
         few = len(self._dims) == SHARING
