@@ -71,7 +71,18 @@ async def test_a_socket_lies_beside_a_recording_however_long_its_path_is(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Unix sockets")
-async def test_the_socket_of_a_killed_recorder_is_removed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_raced", [False, True])
+async def test_the_socket_of_a_killed_recorder_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_raced: bool
+) -> None:
+    """Also where another recorder removes it at the same time."""
+
+    def removed(path: Path) -> socket.socket:
+        path.unlink()
+        raise ConnectionRefusedError
+
+    if is_raced:
+        monkeypatch.setattr("daq.recording.control._connected", removed)
     left = tmp_path / ".0123456789abcdef.control"
     with socket.socket(socket.AF_UNIX) as killed:
         killed.bind(str(left))

@@ -16,7 +16,7 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
-from daq.protocols.block import Block, HostTime
+from daq.protocols.block import Block, BlockFlag, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording, control_address
 from daq.recording.repair import repair, verify, write_results
@@ -230,6 +230,21 @@ def test_a_file_being_written_is_not_repaired(tmp_path: Path) -> None:
         with pytest.raises(OSError, match="lock"):
             h5py.File(path, "r+")
         writer.send_signal(signal.SIGKILL)
+
+
+def test_a_first_block_of_one_sample_is_verified(tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    channels = (Channel(name="x", sensitivity=1.0),)
+    sensor = SensorLayout("a", channels, 100.0, np.dtype("i4"))
+    writer = RecordingWriter.create(path, sensors=[sensor], created=NOW)
+    counts = np.arange(50, dtype=np.int32)[:, None]
+    writer.append(Block("a", 0, counts[:1], NOW, flags=BlockFlag.CLOCK_RESTART))
+    writer.append(Block("a", 1, counts[1:], NOW))
+    writer.close()
+    with h5py.File(path, "r+") as file:
+        file["sensors/a/samples"][0] = 7
+    (found,) = verify(path).sensors
+    assert found.bad_blocks == (0,)
 
 
 def test_damage_is_found_and_reported(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_round_trip(tmp_path: Path) -> None:
     )
     writer.append(block("b", 0, 130, flags=BlockFlag.CLOCK_RESTART, device_counter=7))
     writer.append(block("b", 150, 70, reason="cable"))
-    writer.gap("b", 130, 20, reason="Käbel" * 30, estimated=True)
+    writer.gap("b", 130, 20, reason="K" + 60 * "ä", estimated=True)
     instants = np.arange(50, dtype=np.int64) * 10_000_000
     writer.append(block("a", 0, 50, instants_ns=instants))
     writer.event(Event("b", EventKind.CONNECTED, "hello", NOW))
@@ -105,8 +105,7 @@ def test_round_trip(tmp_path: Path) -> None:
         assert b.blocks["monotonic_ns"].tolist() == [at(130).monotonic_ns, at(220).monotonic_ns]
         (gap,) = b.gaps
         assert (gap["first_sample"], gap["missing"], gap["estimated"]) == (130, 20, 1)
-        assert len(gap["reason"]) in {99, 100}
-        assert gap["reason"].decode().startswith("KäbelKäbel")
+        assert gap["reason"].decode() == "K" + 49 * "ä"  # 100 bytes at most
         np.testing.assert_array_equal(a.instants_ns(), instants)
         assert a.polled
         assert not b.polled

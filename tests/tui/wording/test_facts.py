@@ -16,8 +16,10 @@ from rich.console import Console
 import huddle
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Bridged, Snapshot
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import MethodRefused
+from daq.results.facts.model import ModelPasses
 from daq.results.facts.recordings import BlocksDamaged, SensorsSimulated
 from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
@@ -25,6 +27,8 @@ from daq.results.sources import sources
 from estimator.checks.advice import Advice, Rank
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import record
+from tests.tui.report.written_report import assert_as_kept
+from tests.tui.wording.advice_examples import MISFIT
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.application.result_view.result_text import result
 from tui.application.state import State
@@ -65,6 +69,40 @@ def test_words_are_a_line_and_sentences(fact: Fact) -> None:
     assert len(words.line) <= 140, words.line
     if fact.rank is not Rank.TO_KNOW and not isinstance(fact, Finding):
         assert words.explanation[0].isupper() or words.explanation.startswith(fact.method)
+
+
+def test_all_words_of_all_kinds_are_as_kept() -> None:
+    lines = (
+        f"{fact.name}, {fact.rank}: {each}"
+        for fact in EXAMPLES
+        for each in (fact.words.line, fact.words.explanation, fact.words.action)
+        if each
+    )
+    assert_as_kept(lines, Path(__file__).parent / "words.txt")
+
+
+def test_the_model_passes_only_where_every_clock_is_understood() -> None:
+    snapshot = diagnosed()
+    names = {each.name for each in Result(snapshot, SETTINGS).facts}
+    first, *others = snapshot.clocks
+    clocks = (replace(first, is_understood=False), *others)
+    doubtful = {each.name for each in Result(replace(snapshot, clocks=clocks), SETTINGS).facts}
+    passes = next(each.name for each in EXAMPLES if isinstance(each, ModelPasses))
+    assert passes in names
+    assert passes not in doubtful
+
+
+def test_findings_of_one_kind_name_sensors_only_if_each_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    snapshot = diagnosed()
+    for sensors, named in ((((0,), (2,)), ("A", "C")), (((0,), ()), ())):
+        advice = tuple(replace(MISFIT, sensors=each) for each in sensors)
+        diagnostics = replace(snapshot.diagnostics, dimensions=())
+        monkeypatch.setattr(SnapshotDiagnostics, "advice", advice)
+        facts = Result(replace(snapshot, diagnostics=diagnostics), SETTINGS).facts
+        (found,) = (each for each in facts if isinstance(each, Finding))
+        assert found.sensors == named
 
 
 @pytest.fixture(scope="module")
