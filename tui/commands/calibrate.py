@@ -77,7 +77,7 @@ def calibrate(
         table = shown.noise_table(found, snapshot.unit)
         _show(screen, "Noise, by the calibrated sensitivities", table)
         _show(screen, "Budget of the noise PSD, relative", shown.budget_table(noise))
-    for line in (shown.LEGEND, *shown.remarks(found, snapshot)):
+    for line in (shown.legend(found.budgets), *shown.remarks(found, snapshot)):
         screen.print(line)
     for each in result.facts:
         if each.needs_action:

@@ -25,41 +25,42 @@ _VARIES = 1.5
 _ALIGNED = 3.0
 """Standard errors from 0 and 180° from which on an angle is shown with its error."""
 _ROUNDING = 1e-6
-_SHORT = {
-    "estimate": "est.",
-    "variation": "var.",
-    "clocks": "clocks",
-    "leakage": "leak.",
-    "quantisation": "quant.",
-    "certificate": "cert.",
-    "tolerance": "tol.",
-    "temperature": "temp.",
-    "sensitivity": "sens.",
-    "edges": "edges",
-    "gaps": "gaps",
-    "misfit": "misfit",
-    "shared-noise": "shared",
-    "dimensions": "dim.",
-    "axes": "axes",
-    "faulty": "faulty",
-    "drift": "drift",
-    "changes": "changes",
-    "linearity": "lin.",
+_SOURCES = {
+    "estimate": ("est.", "finite averages"),
+    "variation": (
+        "var.",
+        "scatter over the frequencies beyond that, by incoherence or by responses that vary",
+    ),
+    "clocks": ("clocks", "error of the alignment of the clocks"),
+    "leakage": ("leak.", "leakage by the width and the edges of segments"),
+    "quantisation": ("quant.", "quantisation"),
+    "certificate": ("cert.", "certificate of the reference"),
+    "tolerance": ("tol.", "tolerance of the reference, without a certificate"),
+    "temperature": ("temp.", "temperature"),
+    "sensitivity": ("sens.", "twice the uncertainty of the sensitivity"),
+    "edges": ("edges", "leakage at the edges of segments"),
+    "gaps": ("gaps", "leakage by gaps"),
+    "misfit": ("misfit", "motion that the model does not explain"),
+    "shared-noise": ("shared", "noise that channels share"),
+    "dimensions": ("dim.", "doubtful number of dimensions of the motion"),
+    "axes": ("axes", "motion outside the sensors' axes"),
+    "faulty": ("faulty", "a faulty channel"),
+    "drift": ("drift", "change of the response during the recording"),
+    "changes": ("changes", "motion that a change of the response leaves in the noise"),
+    "linearity": ("lin.", "squares and cubes of the motion"),
 }
-LEGEND = (
-    "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from other "
-    "sources. est.: finite averages. var.: scatter over the frequencies beyond that, by "
-    "incoherence or by responses that vary. clocks: error of the alignment of the clocks. leak.: "
-    "leakage by the width and the edges of segments. quant.: quantisation. cert.: certificate of "
-    "the reference; tol.: its tolerance, without one. drift: change of the response during the "
-    "recording; changes: motion that this leaves in the noise. lin.: squares and cubes of the "
-    "motion. sens.: twice the uncertainty of the "
-    "sensitivity. temp.: temperature. edges, gaps: leakage at the "
-    "edges of segments and by gaps. misfit: motion that the model does not explain. shared: noise "
-    "that channels share. dim.: doubtful number of dimensions of the motion. axes: motion outside "
-    "the sensors' axes. u: combined standard uncertainty. U: expanded uncertainty, k u. "
-    "1–2: angle between the first and the second channel, less 90°."
-)
+"""Short and in words."""
+
+
+def legend(budgets: Iterable[Budget]) -> str:
+    """Return what the short words of tables of calibration mean, of budgets those there are."""
+    there = {part.source for budget in budgets for part in budget.components}
+    words = [f"{short}: {text}." for source, (short, text) in _SOURCES.items() if source in there]
+    return (
+        "Budgets are relative standard uncertainties. A: from the scatter of these data; B: from "
+        f"other sources. {' '.join(words)} u: combined standard uncertainty. U: expanded "
+        "uncertainty, k u. 1–2: angle between the first and the second channel, less 90°."
+    )
 
 
 def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
@@ -194,7 +195,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
     header = (
         "sensor",
         "channel",
-        *(f"{_SHORT.get(source, source)} ({types[source]})" for source in sources),
+        *(f"{_SOURCES.get(source, (source,))[0]} ({types[source]})" for source in sources),
         "u",
         "k",
         "U",

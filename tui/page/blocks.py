@@ -66,6 +66,8 @@ class Plot:
         Rows of the key above the panels, of what they have labelled.
     titled : bool
         Whether panels have titles of their own.
+    is_continued : bool
+        Whether the next plot has the same horizontal axis, whose labels serve both.
     """
 
     title: str
@@ -76,6 +78,7 @@ class Plot:
     right: float = 0.15
     key_rows: int = 0
     titled: bool = False
+    is_continued: bool = False
 
 
 def three_to_a_row(

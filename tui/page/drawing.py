@@ -62,8 +62,10 @@ DASHES = ((4, 1.2), (1.2, 1.2), (6, 1.2, 1.2, 1.2), (6, 1.2, 1.2, 1.2, 1.2, 1.2)
 MODEL_DASHES = ((7, 2), (6, 1.5, 1, 1.5), (2.5, 1.2), (6, 1.5, 1, 1.5, 1, 1.5))
 """Of noise models; none is dotted, as the band and the quantisation are."""
 
-LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.19
+LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.14
 """Room left of a row of axes, between them, above, for titles, below, and for a row of the key."""
+TICKS = 0.06
+"""Room below a row of axes whose labels are below the next row."""
 STACKED_TITLE = 0.25
 """Room above a plot for the name of its sensor."""
 
@@ -119,7 +121,7 @@ def look() -> Iterator[None]:
 
 def height_of(plot: Plot) -> float:
     """Return how high a plot is with all that belongs to it, in inches."""
-    return _above(plot) + plot.height + BOTTOM
+    return _above(plot) + plot.height + (TICKS if plot.is_continued else BOTTOM)
 
 
 def draw(plot: Plot, figure: Figure, *, left: float, top: float, width: float) -> None:
@@ -141,6 +143,9 @@ def draw(plot: Plot, figure: Figure, *, left: float, top: float, width: float) -
         if number:
             axes.tick_params(axis="y", labelleft=False, length=0)
             axes.set_ylabel("")
+        if plot.is_continued:
+            axes.tick_params(axis="x", labelbottom=False)
+            axes.set_xlabel("")
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             named.setdefault(label, handle)
     if plot.key_rows and named:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import singledispatchmethod
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -27,12 +28,14 @@ from tui.page.table import Cell, Table, Tone, tone_of
 
 MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
 TITLE, VERDICT = 17.0, 10.0
-SINGLE = 3.3
+SINGLE = 2.3
 """Least width of a plot with one panel."""
 GUTTER = 0.14
 """Between what is side by side."""
 TOGETHER = 2.6
 """Tables that are lower are not broken."""
+LEAST = 0.8
+"""Width of a column of words that gives way."""
 BOX = 0.42
 """Height of a box to be filled in."""
 LONGEST = 1500
@@ -85,7 +88,7 @@ class _Sizes:
 
 
 _RESULT = _Sizes(8.5, 7.5, 7.0, 11.0, 1.4, 0.16, 0.05, 0.03, 0.12, 1.45, 0.05, 1, 0.8)
-_ANNEX = _Sizes(7.0, 6.2, 6.0, 9.0, 1.25, 0.08, 0.03, 0.016, 0.06, 1.1, 0.02, 2, 0.6)
+_ANNEX = _Sizes(7.0, 6.2, 6.0, 9.0, 1.2, 0.08, 0.03, 0.016, 0.06, 1.1, 0.02, 2, 0.6)
 _COLOURS: dict[Tone, str] = {
     "plain": drawing.INK,
     "quiet": "#5c6670",
@@ -245,11 +248,18 @@ class _Paper(FPDF):
         self.set_line_width(0.008)
         self.line(MARGIN, self.y, MARGIN + INNER, self.y)
         self.ln(0.08)
-        for beside in self._beside(parts):
+        rows = list(self._beside(parts))
+        for beside, below in pairwise([*rows, []]):
+            one = beside[0]
             if len(beside) > 1:
                 self._side_by_side(beside)
+            elif isinstance(one, Plot) and one.is_continued:  # not on another page
+                if self.will_page_break(self.height(one)):
+                    self.add_page()
+                room = sum(map(self.height, [one, *below]))
+                self.part(replace(one, is_continued=not self.will_page_break(room)))
             else:
-                self.part(*beside)
+                self.part(one)
 
     @singledispatchmethod
     def part(self, part: Part) -> None:
@@ -345,13 +355,17 @@ class _Paper(FPDF):
     def _least_width(self, part: Part) -> float:
         """Return the width that a part takes at least; of most, all there is."""
         if isinstance(part, Table):
-            return sum(self._words(part))
-        return SINGLE if isinstance(part, Plot) and len(part.panels) == 1 else INNER
+            self._style(self.sizes.table, bold=True)
+            return max(sum(self._words(part)), float(self.get_string_width(part.title)))
+        if isinstance(part, Plot):
+            return SINGLE if part.n_columns == 1 else INNER * len(part.panels) / part.n_columns
+        return INNER
 
     def _side_by_side(self, parts: Sequence[Part]) -> None:
         least = [self._least_width(part) for part in parts]
         spare = (INNER - GUTTER * (len(parts) - 1) - sum(least)) / len(parts)
-        if self.will_page_break(max(map(self.height, parts))):
+        heights = (self.height(part, each + spare) for part, each in zip(parts, least, strict=True))
+        if self.will_page_break(max(heights)):
             self.add_page()
         top = below = self.y
         for part, width in zip(parts, least, strict=True):
@@ -359,7 +373,7 @@ class _Paper(FPDF):
             if isinstance(part, Table):
                 self._table(part, self._words(part), width + spare)
             elif isinstance(part, Plot):
-                self._plot(part, width + spare)
+                self._plot(replace(part, n_columns=len(part.panels)), width + spare)
             below = max(below, self.y)
             self.set_left_margin(self.l_margin + width + spare + GUTTER)
         self.set_left_margin(MARGIN)
@@ -398,7 +412,7 @@ class _Paper(FPDF):
                     row.cell(_shown(cell), style=style)
         self.ln(self.sizes.part)
 
-    def height(self, part: Part) -> float:
+    def height(self, part: Part, width: float = INNER) -> float:
         """Return about how high a part is."""
         sizes, line = self.sizes, self._line
         self._style(sizes.text)
@@ -414,7 +428,8 @@ class _Paper(FPDF):
                 )
             case Plot():
                 shown = replace(part, height=sizes.plot * part.height)
-                return drawing.height_of(shown) + (line + 0.05 if part.title else 0.0)
+                title = line * self._n_lines(part.title, width) + 0.05 if part.title else 0.0
+                return drawing.height_of(shown) + title
             case Signatures():
                 return BOX + 0.08
             case Table():
@@ -484,9 +499,11 @@ class _Paper(FPDF):
         """
         widths = self._words(table)
         if sum(widths) > INNER:
-            # names are read first: their column gives way only if it is the only one of words
+            # names are read first: their column gives way only if no other one of words can
             words = [c for c in range(len(widths)) if c in table.left]
-            give = [c for c in words if c] or words or list(range(len(widths)))
+            give = [c for c in words if c]
+            if sum(widths) - sum(widths[c] - LEAST for c in give) > INNER:
+                give = words or list(range(len(widths)))
             fixed = sum(width for column, width in enumerate(widths) if column not in give)
             left = max(INNER - fixed, 0.4 * len(give))
             for column in sorted(give, key=lambda c: widths[c]):  # narrow ones keep their width

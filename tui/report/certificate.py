@@ -7,6 +7,7 @@ people.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from daq.bench.durations import format_duration
@@ -15,7 +16,7 @@ from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.estimation.settings import Settings
 from daq.protocols.block import Quantity
 from daq.results.sources import Condition, Source, conditions
-from tui.page.blocks import KeyValues, Paragraph, Part, Section
+from tui.page.blocks import KeyValues, Paragraph, Part
 from tui.page.table import Table
 from tui.wording.formatting import plain_number, utc_time
 
@@ -38,6 +39,10 @@ PROCEDURE = (
 )
 SPECIMEN = "SPECIMEN"
 """Number and watermark of what only shows how a certificate looks."""
+NOT_VERIFIED = (
+    "Given by the customer or user, and not verified: data of the sensors and of the parties,"
+    " sensitivities without a certificate."
+)
 SCOPE = (
     "The results relate only to the items listed, as received, and to the time and place of the"
     " test. The certificate may be reproduced only in full, unless the laboratory agrees in"
@@ -254,11 +259,11 @@ def notices(
         text = "SIMULATED SENSORS: the noise is that of a model. No instrument was measured."
         lines.append(Paragraph(text, "bad"))
     if issue is None:
-        lines.append(Paragraph("DRAFT: not a certificate. huddle issue makes one.", "doubtful"))
-        left = missing(bench, found[0])
+        text = "DRAFT: not a certificate. huddle issue makes one."
+        left = len(missing(bench, found[0]))
         if left:
-            text = ", ".join(each.what for each in left)
-            lines.append(Paragraph(f"Not given: {text}.", "doubtful"))
+            text += f" Not given: {left} of its {len(CHECKLIST)} entries; see the annex."
+        lines.append(Paragraph(text, "doubtful"))
     elif issue.is_specimen:
         text = "SPECIMEN: not a certificate. It has no number and is in no ledger."
         lines.append(Paragraph(text, "bad"))
@@ -315,7 +320,7 @@ def watermark(found: Sequence[Source], issue: Issue | None) -> str:
     return "SIMULATED" if simulated else "DRAFT" if issue is None else ""
 
 
-def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -> Section:
+def parties(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -> list[Part]:
     """Return laboratory, customer, items, procedure and traceability."""
     laboratory = Laboratory() if bench is None else bench.laboratory
     customer = Customer() if bench is None else bench.customer
@@ -323,6 +328,7 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
     first, last = found[0], found[-1]
     place = table.place or first.location or laboratory.address
     rows = [
+        ("Bench", first.bench.name if first.bench else _NONE),
         ("Laboratory", _joined(laboratory.name, laboratory.address)),
         ("Contact", _joined(laboratory.email, laboratory.phone)),
         ("Accreditation", laboratory.accreditation or "none claimed"),
@@ -331,6 +337,7 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
         ("Place of the test", place or _NONE),
         ("Received", _NONE if table.received is None else table.received.isoformat()),
         ("Condition", table.condition or _NONE),
+        ("Location", first.location if first.location != place else ""),
         ("Tested", f"{utc_time(first.started)} to {utc_time(last.last)}"),
         ("Procedure", table.procedure or _NONE),
         ("Method", PROCEDURE),
@@ -339,27 +346,16 @@ def parties_section(found: Sequence[Source], bench: Bench | None, issue: Issue |
         ("Operator", first.operator or _NONE),
         ("Authorised by", (issue.by if issue else table.responsible) or _NONE),
         ("Date of issue", f"{issue.at:%Y-%m-%d}" if issue and issue.entry else "not issued"),
+        ("Report made by", f"huddle {version('huddle-bench')}"),
     ]
     if issue is not None and issue.entry:
         rows.append(("Entry of the ledger", issue.entry))
-    keys = {} if issue is not None else {e.what: e.key for e in missing(bench, found[0])}
-    absent = [name for name, value in rows if value == _NONE]
-    parts: tuple[Part, ...] = (
-        KeyValues(tuple(row for row in rows if row[1] != _NONE)),
-        *([Paragraph(f"Not given: {', '.join(absent)}.")] if absent else []),
-        *(
-            [Paragraph("Keys of the bench file: " + "; ".join(map(" = ".join, keys.items())) + ".")]
-            if keys
-            else []
-        ),
-        Paragraph(
-            "Given by the customer or user, and not verified: data of the sensors and of the"
-            " parties, sensitivities without a certificate.",
-            "quiet",
-        ),
-        Paragraph(SCOPE, "quiet"),
-    )
-    return Section("Laboratory, customer and procedure", parts)
+    parts: list[Part] = [KeyValues(tuple(row for row in rows if row[1] not in {_NONE, ""}))]
+    absent = [f"{e.what} ({e.key})" for e in missing(bench, found[0])] if issue is None else []
+    absent = absent or [name for name, value in rows if value == _NONE]
+    if absent:
+        parts.append(Paragraph(f"Not given: {'; '.join(absent)}."))
+    return parts
 
 
 QUANTITIES = {Quantity.TEMPERATURE: "temperature", Quantity.SUPPLY: "supply voltage"}
@@ -375,7 +371,9 @@ def outside_range(stated: Sequence[Condition]) -> list[str]:
     ]
 
 
-def conditions_section(found: Sequence[Source], about: Bench | None, settings: Settings) -> Section:
+def conditions_stated(
+    found: Sequence[Source], about: Bench | None, settings: Settings
+) -> list[Part]:
     """Return what devices and computer stated, and what is outside the data sheet's range."""
     stated = conditions(found, about, start=settings.start, end=settings.end)
     rows = [
@@ -391,12 +389,12 @@ def conditions_section(found: Sequence[Source], about: Bench | None, settings: S
     ]
     titles = ("of", "quantity", "unit", "lowest", "highest", "readings", "range of the data sheet")
     silent = {sensor.name for sensor in found[0].sensors} - {each.sensor for each in stated}
-    note = "Read from the devices once a minute."
+    note = "Conditions are read from the devices once a minute."
     if silent:
         note += f" Nothing is stated by {', '.join(sorted(silent))}."
     parts: list[Part] = [Table(titles, tuple(rows))] if rows else []
     parts += [Paragraph(text, "bad") for text in outside_range(stated)]
-    return Section("Conditions", (*parts, Paragraph(note, "quiet")))
+    return [*parts, Paragraph(note, "quiet")]
 
 
 def _quantity(quantity: Quantity | str) -> tuple[str, str]:

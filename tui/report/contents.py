@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.metadata import version
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ from tui.output import calibration as shown
 from tui.page.blocks import KeyValues, Paragraph, Part, Report, Section, Signatures
 from tui.page.table import Table
 from tui.report import certificate, evidence
-from tui.report.noise import limits_section, noise_section, verdict
+from tui.report.noise import result_section, verdict
 from tui.report.parameters import parameters_section
 from tui.report.uncertainty import uncertainty_section
 from tui.wording.formatting import is_known, local_time, utc_time
@@ -56,7 +55,7 @@ def calibration_section(result: Result) -> Section | None:
     if found.certificates:
         parts.append(_certificates(found, snapshot))
     parts += [replace(table, title=name) for name, table in tables if table.rows]
-    parts += [Paragraph(line, "quiet") for line in (shown.LEGEND, *remarks)]
+    parts += [Paragraph(line, "quiet") for line in (shown.legend(budgets), *remarks)]
     return Section("Calibration", tuple(parts))
 
 
@@ -107,7 +106,7 @@ def report_of(
     about : Bench, optional
         Where laboratory, customer and sensors are described; default: the recorded bench.
     """
-    snapshot, found, judged = result.snapshot, result.sources, result.verdict
+    snapshot, found = result.snapshot, result.sources
     bench = found[0].bench
     sentence = verdict(result)
     states = {source.state for source in found}
@@ -121,16 +120,9 @@ def report_of(
     about = bench if about is None else about
     by_rule = with_rule(bench, about)
     facts = result.facts
+    rule = None if by_rule is None else by_rule.certificate
     sections = [  # the result comes first; what it rests on follows
-        limits_section(
-            snapshot,
-            judged,
-            conformity(by_rule, result),
-            None if by_rule is None else by_rule.certificate,
-        ),
-        noise_section(result, models),
-    ]
-    annex = [
+        result_section(result, models, conformity(by_rule, result), rule),
         evidence.facts_section(facts),
         uncertainty_section(result, about),
         parameters_section(result),
@@ -138,16 +130,26 @@ def report_of(
         evidence.model_test_section(result),
         evidence.alignment_section(result),
         evidence.clocks_section(result),
-        evidence.signal_section(result),
-        evidence.events_section(snapshot, found),
-        certificate.parties_section(found, about, issue),
-        _test_section(found),
-        _sensors_section(snapshot, found, about),
-        certificate.conditions_section(found, about, result.settings),
+        evidence.events_section(result),
+        Section(
+            "Laboratory, customer and test",
+            (
+                *certificate.parties(found, about, issue),
+                *_recordings(found),
+                Paragraph(f"{certificate.NOT_VERIFIED} {certificate.SCOPE}", "quiet"),
+            ),
+        ),
+        Section(
+            "Sensors and conditions",
+            (
+                *_sensors(snapshot, found, about),
+                *certificate.conditions_stated(found, about, result.settings),
+            ),
+        ),
         _settings_section(result),
         Section(
             "Signed off",
-            (Signatures(("Name", "Date", "Signature")), Signatures(("Remarks",))),
+            (Signatures(("Name", "Date", "Signature", "Remarks")),),
         ),
     ]
     start = found[0].started
@@ -157,8 +159,8 @@ def report_of(
         subtitle=f"Huddle test {name}" + (f", {utc_time(start)}" if is_known(start) else ""),
         verdict=sentence,
         sections=tuple(
-            replace(by_sensor(each, snapshot), is_annex=number >= len(sections))
-            for number, each in enumerate((*sections, *annex))
+            replace(by_sensor(each, snapshot), is_annex=number > 0)
+            for number, each in enumerate(sections)
             if each is not None
         ),
         notices=(*certificate.notices(found, result, about, issue), *evidence.invalidating(facts)),
@@ -184,7 +186,7 @@ def _grouped(table: Table, sensors: Mapping[str, tuple[str, str]]) -> Table:
     order = [
         sensor for sensor, _ in groupby(sensors.get(row[0], ("", ""))[0] for row in table.rows)
     ]
-    if len(order) > len(set(order)):  # sorted by something else
+    if 2 * len(order) > len(table.rows):  # sorted by something else, or a channel each
         return table
     rows: list[tuple[str, ...]] = []
     before = ""
@@ -197,17 +199,9 @@ def _grouped(table: Table, sensors: Mapping[str, tuple[str, str]]) -> Table:
     return replace(table, rows=tuple(rows))
 
 
-def _test_section(found: Sequence[Source]) -> Section:
-    first = found[0]
-    rows: list[tuple[str, str]] = []
-    if first.bench is not None:
-        rows.append(("Bench", first.bench.name))
-    rows += [
-        ("Operator", first.operator or "not given"),
-        ("Location", first.location or "not given"),
-        ("Report made by", f"huddle {version('huddle-bench')}"),
-    ]
-    parts: list[Part] = [KeyValues(tuple(rows))]
+def _recordings(found: Sequence[Source]) -> list[Part]:
+    """Return what is known of each file."""
+    parts: list[Part] = []
     for source in found:
         length = (source.last - source.started).total_seconds()
         size = f"{source.n_bytes / 1e6:.1f} MB, {_STATES[source.state]}"
@@ -215,21 +209,23 @@ def _test_section(found: Sequence[Source]) -> Section:
             KeyValues(
                 (
                     ("Recording", f"{source.path.name} ({size})"),
-                    ("Started", utc_time(source.started)),
+                    *([("Started", utc_time(source.started))] if len(found) > 1 else []),
                     ("Local time", local_time(source.started, source.bench)),
-                    ("Last sample received", utc_time(source.last)),
+                    *([("Last sample", utc_time(source.last))] if len(found) > 1 else []),
                     ("Duration", format_duration(round(length))),
                     ("Recorded by", source.software),
                     ("Run", source.run_id),
-                    ("SHA-256", source.sha256 or "none: the file is still being written"),
                     ("Signed with key", source.signed_by or "not signed"),
+                    ("SHA-256", source.sha256 or "none: the file is still being written"),
                 )
             )
         )
-    return Section("The test", tuple(parts))
+    return parts
 
 
-def _sensors_section(snapshot: Snapshot, found: Sequence[Source], about: Bench | None) -> Section:
+def _sensors(
+    snapshot: Snapshot, found: Sequence[Source], about: Bench | None
+) -> tuple[Table, Table]:
     makers = certificate.manufacturers(about)
     sensors = found[-1].sensors
     clocks = {clock.sensor: clock for clock in snapshot.clocks}
@@ -254,7 +250,7 @@ def _sensors_section(snapshot: Snapshot, found: Sequence[Source], about: Bench |
         tuple(row for sensor in sensors for row in _channel_rows(sensor)),
         left=frozenset({0, 1, 3, 4}),
     )
-    return Section("Sensors", (Table(header, rows, left=frozenset({0, 1, 2, 3, 4})), channels))
+    return Table(header, rows, left=frozenset({0, 1, 2, 3, 4})), channels
 
 
 def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:
@@ -295,25 +291,23 @@ def _settings_section(result: Result) -> Section:
         ("Common grid", f"{rate:.10g} Hz"),
         ("Frequency resolution", f"{1 / settings.segment:.4g} Hz between frequencies"),
         ("Segments used", f"{snapshot.n_segments}, n = {snapshot.n_effective:.1f} effective"),
-        ("Band of the tables", span(*result.band)),
+        *([] if settings.band else [("Band of the tables", span(*result.band))]),
         ("Unit", f"{snapshot.unit}; PSD one-sided, in ({snapshot.unit})²/Hz"),
     ]
     usual = Settings()
-    options = {
-        key: (_option(OPTIONS[name], getattr(settings, name)), getattr(usual, name))
-        for key, name in table_keys().items()
-    }
-    same = {
-        key: text
-        for key, name in table_keys().items()
-        if getattr(settings, name) == options[key][1]
-        for text in [options[key][0]]
-    }
-    rows += [(f"[estimate] {key}", text) for key, (text, _) in options.items() if key not in same]
-    defaults = ", ".join(f"{key} {text}" for key, text in same.items())
+    same: dict[bool, list[str]] = {True: [], False: []}
+    for key, name in table_keys().items():
+        value = getattr(settings, name)
+        if value != getattr(usual, name):
+            rows.append((f"[estimate] {key}", _option(OPTIONS[name], value)))
+        elif value is None or value in ({}, ()):
+            same[False].append(key)
+        else:
+            same[True].append(f"{key} {_option(OPTIONS[name], value)}")
+    text = "[estimate], as by default: {}. Not given: {}."
     parts: list[Part] = [
         KeyValues(tuple(rows)),
-        Paragraph(f"[estimate], as by default: {defaults}."),
+        Paragraph(text.format(*(", ".join(each) for each in same.values()))),
     ]
     if snapshot.octaves:
         parts.append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 
 import numpy as np
@@ -18,7 +18,7 @@ from daq.results.clock_effect import grade, reference, residuals
 from daq.results.facts.fact import MARKS, Fact
 from daq.results.result import Result
 from daq.results.signal import Signal
-from daq.results.sources import LoggedEvent, Source, uncounted_events, with_uncounted
+from daq.results.sources import LoggedEvent, uncounted_events, with_uncounted
 from daq.results.vocabulary import clock_source
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_sensors import ANY_AXES
@@ -28,7 +28,7 @@ from estimator.checks.relative_response import RelativeResponse
 from estimator.likelihood.goodness_of_fit import rejected_below
 from estimator.wording import several, span
 from tui.page.blocks import Paragraph, Part, Section
-from tui.page.table import Cell, Table
+from tui.page.table import Cell, Table, Tone
 from tui.report.figures.drift import drift_plot
 from tui.report.figures.model_test import model_test_plot
 from tui.report.figures.signal import signal_plots
@@ -63,7 +63,8 @@ def model_test_section(result: Result) -> Section:
     def fails(band: BandDiagnosis) -> bool:
         return band.test.p_value < rejected
 
-    runs = [list(run) for failing, run in groupby(tested, key=fails) if failing]
+    grouped = [(failing, list(run)) for failing, run in groupby(tested, key=fails)]
+    runs = [run for failing, run in grouped if failing]
     parts: list[Part] = []
     if runs:
         where = "; ".join(_run_in_words(run) for run in runs)
@@ -103,30 +104,17 @@ def model_test_section(result: Result) -> Section:
             plot,
         ]
     rows: list[tuple[str, ...]] = []
-    for band in tested:
-        snr = band.snr[np.isfinite(band.snr)]
-        failed = Cell("fails", "bad" if _ratio(band) > 2 else "doubtful")
-        rows.append(
-            (
-                f"{band.low:.3g}–{band.high:.3g}",
-                plain_number(band.coherence, ".4f"),
-                scientific(band.condition, 2),
-                plain_number(band.dimension, ".0f"),
-                f"{_snr(snr.min())} … {_snr(snr.max())}" if snr.size else NOTHING,
-                plain_number(_ratio(band), ".3f"),
-                failed if fails(band) else "holds",
-                probability(band.test.p_value),
-            )
-        )
+    for failing, run in grouped:  # bands that hold go together
+        rows += [_test_row([band], failing=True) for band in run] if failing else [_test_row(run)]
     header = (
-        "band (Hz)", "least coherence", "condition", "dimension", "SNR (dB)",
+        "bands (Hz)", "least coherence", "condition", "dimension", "SNR (dB)",
         "statistic / expected", "test", "p",
     )  # fmt: skip
     parts += [
         Table(header, tuple(rows), left=frozenset({6})),
         Paragraph(
             f"A band fails where p is below {rejected:.2g}. One sound test in a hundred has a band "
-            "that fails.",
+            "that fails. Bands that hold go together, with their number and the range of values.",
             "quiet",
         ),
     ]
@@ -221,8 +209,8 @@ def clocks_section(result: Result) -> Section:
     return Section("Clocks", tuple(parts))
 
 
-def signal_section(result: Result) -> Section | None:
-    """Return the recording against time; None where it cannot be read any more.
+def _against_time(result: Result) -> list[Part]:
+    """Return the recording against time; nothing where it cannot be read any more.
 
     Of several recordings the first one; spectrograms are of the first channel.
     """
@@ -236,23 +224,21 @@ def signal_section(result: Result) -> Section | None:
                 most_spectra=MOST_SPECTROGRAMS,
             )
     except (HuddleError, OSError):
-        return None
+        return []
     text = "Extremes of each channel. Red: gaps; grey: excluded; dashed: remarks."
     if len(result.sources) > 1:
         text = f"The first of {len(result.sources)} recordings. {text}"
-    return Section("The recording against time", (Paragraph(text, "quiet"), *plots))
+    return [Paragraph(text, "quiet"), *plots]
 
 
-def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
-    """Return what happened while recording, and which segments were used."""
-    text = f"{several(snapshot.n_segments, 'segment')} used"
-    text += f" ({snapshot.n_effective:.0f} effective averages)."
-    parts: list[Part] = [Paragraph(text)]
-    recorded = (each for source in found for each in source.logged_events)
-    logged_events = with_uncounted(recorded, uncounted_events(snapshot.clocks))
+def events_section(result: Result) -> Section:
+    """Return the recording against time, and what happened."""
+    parts = _against_time(result)
+    recorded = (each for source in result.sources for each in source.logged_events)
+    logged_events = with_uncounted(recorded, uncounted_events(result.snapshot.clocks))
     if not logged_events:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
-        return Section("What happened", tuple(parts))
+        return Section("The recording against time", tuple(parts))
     together = _together(logged_events)
     rows = [
         (
@@ -273,15 +259,16 @@ def events_section(snapshot: Snapshot, found: Sequence[Source]) -> Section:
     parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4))))
     if left > 0:
         parts.append(Paragraph(f"… and {several(left, 'further line')}: see the file.", "quiet"))
-    return Section("What happened", tuple(parts))
+    return Section("The recording against time", tuple(parts))
 
 
 def facts_section(facts: Sequence[Fact]) -> Section:
     """Return what is known of the test beyond its numbers, the worst first."""
-    legend = ", ".join(
-        f"{MARKS[rank]} {words}" for rank, words in RANKS.items() if rank is not Rank.TO_KNOW
+    ranks = {each.rank for each in facts} - {Rank.TO_KNOW}
+    legend = ", ".join(f"{MARKS[rank]} {words}" for rank, words in RANKS.items() if rank in ranks)
+    return Section(
+        "Facts", (fact_items(facts), *([Paragraph(f"{legend}.", "quiet")] if legend else []))
     )
-    return Section("Facts", (fact_items(facts), Paragraph(f"{legend}.", "quiet")))
 
 
 def invalidating(facts: Sequence[Fact]) -> tuple[Paragraph, ...]:
@@ -302,6 +289,27 @@ def _run_in_words(run: Sequence[BandDiagnosis]) -> str:
     where = span(run[0].low, run[-1].high)
     at = f" at {span(worst.low, worst.high)}" if len(run) > 1 else ""
     return f"{where} (statistic {_ratio(worst):.3g} times its expectation{at})"
+
+
+def _test_row(bands: Sequence[BandDiagnosis], *, failing: bool = False) -> tuple[str, ...]:
+    """Return what the model test found in one band, or in several that follow each other."""
+
+    def ends(values: Iterable[float], show: Callable[[float], str]) -> str:
+        known = [value for value in values if not math.isnan(value)]
+        shown = dict.fromkeys(show(value) for value in (min(known), max(known))) if known else ()
+        return " … ".join(shown) or NOTHING
+
+    tone: Tone = "bad" if any(_ratio(band) > 2 for band in bands) else "doubtful"
+    return (
+        f"{bands[0].low:.3g}–{bands[-1].high:.3g}" + f" ({len(bands)})" * (len(bands) > 1),
+        ends((band.coherence for band in bands), lambda value: plain_number(value, ".4f")),
+        ends((band.condition for band in bands), lambda value: scientific(value, 2)),
+        ends((band.dimension for band in bands), lambda value: plain_number(value, ".0f")),
+        ends((float(snr) for band in bands for snr in band.snr if np.isfinite(snr)), _snr),
+        ends(map(_ratio, bands), lambda value: plain_number(value, ".3f")),
+        Cell("fails", tone) if failing else "holds",
+        ends((band.test.p_value for band in bands), probability),
+    )
 
 
 def _snr(ratio: float) -> str:

@@ -8,10 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from daq.bench.masks.mask import SOURCES, Mask
 from daq.bench.tables.certificate import CertificateTable, Rule
 from daq.bench.units import decibels
-from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import BandMeans, known_range
 from daq.results.decision.conformity import Conformity, Statement
-from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.decision.verdict import Verdict
@@ -21,7 +19,6 @@ from tui.page.blocks import Paragraph, Part, Section
 from tui.page.table import Cell, Table
 from tui.report.figures.curves import noise_plots
 from tui.wording.formatting import (
-    NOT_KNOWN,
     NOTHING,
     level,
     level_with_error,
@@ -39,6 +36,9 @@ STATEMENTS: Mapping[Statement, str] = {
 }
 MAX_BANDS = 7
 """Columns of the table of noise by octaves that a page is wide."""
+WIDE = "Mean in wide bands with 95 % interval"
+NOISE_COLUMNS = 4
+"""Columns of the noise in the table of the result."""
 WORST_FIRST = (Verdict.FAIL, Verdict.NOT_DECIDED, Verdict.PASS)
 
 
@@ -50,63 +50,125 @@ def verdict(result: Result) -> Paragraph:
     return Paragraph(" ".join([str(decision), *decision.remarks]), TONES[decision.state])
 
 
-def limits_section(
-    snapshot: Snapshot,
-    found: TestVerdict | None,
+def result_section(
+    result: Result,
+    models: Sequence[Mask] = (),
     statements: Sequence[Conformity] = (),
     table: CertificateTable | None = None,
-) -> Section | None:
-    """Return every channel beside its limits, worst first; None where the bench file has none."""
-    if found is None:
-        return None
-    rows: list[tuple[str, ...]] = []
+) -> Section:
+    """Return the noise of every channel with its limits, worst first, and its curves."""
+    snapshot, found = result.snapshot, result.verdict
+    if not snapshot.results and found is None:
+        return Section("Result", (Paragraph("Nothing can be said yet.", "doubtful"),))
     # without a certificate of any sensitivity nothing is stated, and no rule matters
     is_stated = any(each.is_traceable for each in statements)
+    texts = [_untraceable(statements)] if statements and table is not None else []
+    if is_stated and table is not None:
+        texts.insert(0, decision_rule(table, statements[0].k))
+    parts: list[Part] = [
+        _result_table(result, statements, is_stated=is_stated),
+        *(Paragraph(text) for text in texts if text),
+        *noise_plots(result, models),
+    ]
+    notes = []
+    if found is not None:
+        notes.append(
+            "Margin: to the limit in the worst band a third of an octave wide, or less at notches "
+            "and steps. PASS: its whole interval is above zero in every band; FAIL: below zero in "
+            "one. Intervals of margins: 95 % for all channels and bands together."
+        )
+        if statements and not is_stated:
+            notes.append("Risk: probability of noise above the limit in any band.")
+    notes.append(
+        "± is the 95 % interval of the mean over the band, with all that widens it, sensitivities "
+        "included. SNR: power of the motion over that of the noise. Curves: one-sided power "
+        f"spectral density in dB re 1 ({snapshot.unit})²/Hz (left) and its root in "
+        f"({snapshot.unit})/√Hz (right). Each point is a mean over its share of the axis. Dotted: "
+        "the band of the table. Where the interval reaches the bottom, the noise is known only to "
+        "be below its upper end. Shaded: nothing can be said." + _about_models(models)
+    )
+    return Section("Result", (*parts, Paragraph(" ".join(notes), "quiet")))
+
+
+def _result_table(result: Result, statements: Sequence[Conformity], *, is_stated: bool) -> Table:
+    """Return a row for each channel, or for each of its limits, and those without one last."""
+    snapshot, found = result.snapshot, result.verdict
+    limits = () if found is None else found.limits
+    order = list(dict.fromkeys(each.limit for each in limits))
     by_rule = {(each.limit, each.sensor, each.channel): each for each in statements}
-    order = list(dict.fromkeys(each.limit for each in found.limits))
+    noise = dict(zip((each.name for each in snapshot.channels), _noise(result), strict=True))
+    rows: list[tuple[str, ...]] = []
+    worst = {each.sensor: len(WORST_FIRST) for each in limits}
+    for each in limits:  # channels of a sensor stay together
+        worst[each.sensor] = min(worst[each.sensor], WORST_FIRST.index(each.verdict))
+    by_sensor = list(worst)
     for each in sorted(
-        found.limits, key=lambda e: (order.index(e.limit), WORST_FIRST.index(e.verdict))
+        limits,
+        key=lambda e: (
+            order.index(e.limit),
+            worst[e.sensor],
+            by_sensor.index(e.sensor),
+            WORST_FIRST.index(e.verdict),
+        ),
     ):
-        words = WORDS[each.verdict] if each.known else "no estimate"
-        rows.append(
-            (
-                each.name,
-                each.limit,
-                plain_number(each.frequency, ".3g"),
-                level(each.noise_psd, 1),
-                level(each.limit_psd, 1),
-                margin(each),
-                Cell(words, TONES[each.verdict]),
-            )
+        cells = (
+            *([each.limit] if len(order) > 1 else []),
+            plain_number(each.frequency, ".3g"),
+            level(each.noise_psd, 1),
+            level(each.limit_psd, 1),
+            margin(each).replace(" dB", ""),
+            Cell(WORDS[each.verdict] if each.known else "no estimate", TONES[each.verdict]),
         )
         if by_rule:
             stated = by_rule[each.limit, each.sensor, each.channel]
-            rows[-1] += (STATEMENTS[stated.statement],) * is_stated + (_risk(stated.risk),)
-    method = next((each.method for each in found.limits), "")
-    header: tuple[str, ...] = (
-        "channel", "limit", "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict",
-    )  # fmt: skip
-    if by_rule:
-        header += ("conformity", "risk") if is_stated else ("risk",)
-    note = (
-        f"By the {method} estimate, dB re 1 ({snapshot.unit})²/Hz, in the worst band a third of an "
-        "octave wide, or less at notches and steps. PASS: the whole interval of the margin is "
-        "above zero in every band; FAIL: below zero in one. Intervals: 95 % for all channels and "
-        "bands together, with all that widens them."
-        + ("" if is_stated else " Risk: probability of noise above the limit in any band.")
-    )
-    shown = Table(header, tuple(rows), left=frozenset({0, 1, 6, *([7] if is_stated else [])}))
-    parts: list[Part] = [shown, Paragraph(note, "quiet")]
-    if by_rule and table is not None:
-        parts[1:1] = [
-            Paragraph(text)
-            for text in (
-                decision_rule(table, statements[0].k) if is_stated else "",
-                _untraceable(statements),
+            cells += (STATEMENTS[stated.statement],) * is_stated + (_risk(stated.risk),)
+        rows.append((each.name, *noise.pop(each.name, [""] * NOISE_COLUMNS), *cells))
+    header = [
+        "channel", "recorded (dB)", "self-noise (dB)", f"({snapshot.unit})/√Hz", "SNR (dB)",
+    ]  # fmt: skip
+    if limits:
+        header += ["limit"] * (len(order) > 1)
+        header += ["at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict"]
+        header += (["conformity"] if is_stated else []) + ["risk"] * bool(by_rule)
+    rows += [
+        (name, *cells, *[""] * (len(header) - 1 - NOISE_COLUMNS)) for name, cells in noise.items()
+    ]
+    title = f"Mean over {span(*result.band)}" if snapshot.results else "Limits"
+    title += f" by the {result.method} method" if snapshot.results else ""
+    title += f", dB re 1 ({snapshot.unit})²/Hz"
+    if len(order) == 1:
+        title += f"; limit: {order[0]}"
+    words = {"channel", "limit", "verdict", "conformity"}
+    left = frozenset(n for n, name in enumerate(header) if name in words)
+    return Table(tuple(header), tuple(rows), left=left, title=title)
+
+
+def _noise(result: Result) -> list[tuple[str, ...]]:
+    """Return what each channel recorded, its noise, and the ratio of motion to noise."""
+    snapshot, data, alone = result.snapshot, result.data, result.alone
+    if not snapshot.results:
+        return [("?",) * NOISE_COLUMNS] * len(snapshot.channels)
+    means = result.means(next(iter(snapshot.results)))
+    no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
+    rows: list[tuple[str, ...]] = []
+    for number in range(len(snapshot.channels)):
+        recorded = float(data[number])
+        if number in alone:
+            rows.append((level(recorded, 1), PARTNER_WORDS[alone[number]], "?", "?"))
+            continue
+        mean, low, high = _only(means[number])
+        noise = "withdrawn" if mean > high else _with_error(means[number])
+        if 0 < mean <= high and low <= 0:
+            noise = f"{level(mean)} (below {level(high)})"
+        rows.append(
+            (
+                level(recorded, 1) if recorded > 0 else no_signal,
+                noise,
+                scientific(math.sqrt(mean)) if 0 < mean <= high else NOTHING,
+                _snr(recorded, mean),
             )
-            if text
-        ]
-    return Section("Verdict against the limits", tuple(parts))
+        )
+    return rows
 
 
 def _untraceable(statements: Sequence[Conformity]) -> str:
@@ -154,85 +216,15 @@ def _risk(risk: float) -> str:
     return "> 99.99 %" if risk > 0.9999 else f"{100 * risk:.2g} %"
 
 
-def noise_section(result: Result, models: Sequence[Mask] = ()) -> Section:
-    """Return tables and plots of the noise of every channel."""
-    snapshot = result.snapshot
-    if not snapshot.results:
-        return Section("Self-noise", (Paragraph("Nothing can be said yet.", "doubtful"),))
-    parts: list[Part] = [
-        _band_table(result),
-        *noise_plots(result, models),
-        Paragraph(
-            "The 95 % interval is that of the mean over the band, with all that widens it (see "
-            "the facts, from 1 % of the noise on), sensitivities included. SNR: power of the "
-            "motion over that of the noise. Curves: one-sided power spectral density in dB re 1 "
-            f"({snapshot.unit})²/Hz (left) and its root in ({snapshot.unit})/√Hz (right). Each "
-            "point is a mean over its share of the axis. Dotted: the band of the table. Where the "
-            "interval reaches the bottom, the noise is known only to be below its upper end. "
-            "Shaded: nothing can be said." + _about_models(models),
-            "quiet",
-        ),
-    ]
-    if len(snapshot.results) > 1:
-        parts.append(_methods_table(result))
-    octaves = _octave_table(result)
-    if octaves is not None:
-        parts.append(octaves)
-    return Section("Self-noise", tuple(parts))
-
-
 def _about_models(models: Sequence[Mask]) -> str:
     """Return what noise models are shown, and from where they are."""
     found = [f"{each.name}: {SOURCES.get(each.name, 'mask from a file')}" for each in models]
     return f" Noise models: {'; '.join(found)}." if found else ""
 
 
-def _band_table(result: Result) -> Table:
-    snapshot, band = result.snapshot, result.band
-    method = next(iter(snapshot.results))
-    means, data, alone = result.means(method), result.data, result.alone
-    covs = result.covs_of(method)
-    no_signal = FLAG_WORDS[Flag.DEAD_CHANNEL].short
-    rows = []
-    for number, label in enumerate(snapshot.channels):
-        name, recorded = f"{label.sensor}.{label.channel}", level(float(data[number]), 1)
-        if number in alone:
-            rows.append((name, recorded, PARTNER_WORDS[alone[number]], *["?"] * 5))
-            continue
-        mean = _only(means[number])
-        rows.append(
-            (
-                f"{label.sensor}.{label.channel}",
-                level(float(data[number]), 1) if data[number] > 0 else no_signal,
-                "withdrawn" if mean[0] > mean[2] else level(mean[0]),
-                _interval(mean[1], mean[2]),
-                scientific(math.sqrt(mean[0])) if 0 < mean[0] <= mean[2] else NOTHING,
-                plain_number(covs[number], ".3f"),
-                plain_number(mean[3], ".3f"),
-                _snr(float(data[number]), mean[0]),
-            )
-        )
-    header = (
-        "channel", "recorded (dB)", "self-noise (dB)", "95 % interval (dB)",
-        f"({snapshot.unit})/√Hz", "c.o.v., worst ⅓ octave", "c.o.v., mean", "SNR (dB)",
-    )  # fmt: skip
-    title = f"Mean over {span(*band)} by the {method} method, dB re 1 ({snapshot.unit})²/Hz"
-    return Table(header, tuple(rows), title=title)
-
-
-def _only(means: BandMeans) -> tuple[float, float, float, float]:
-    """Return mean, ends of the interval and c.o.v. of the one band there is."""
-    mean, spread = float(means.mean[0]), float(means.spread[0])
-    cov = spread / abs(mean) if mean else math.nan
-    return mean, float(means.low[0]), float(means.high[0]), cov
-
-
-def _interval(low: float, high: float) -> str:
-    if math.isinf(high):
-        return NOT_KNOWN
-    if not high > 0:
-        return "below 0" if high <= 0 else NOTHING
-    return f"{level(low)} … {level(high)}" if low > 0 else f"below {level(high)}"
+def _only(means: BandMeans) -> tuple[float, float, float]:
+    """Return mean and ends of the interval of the one band there is."""
+    return float(means.mean[0]), float(means.low[0]), float(means.high[0])
 
 
 def _snr(data: float, noise: float) -> str:
@@ -241,24 +233,31 @@ def _snr(data: float, noise: float) -> str:
     return plain_number(decibels(data - noise) - decibels(noise), ".1f") if data > noise else "< 0"
 
 
-def _octave_table(result: Result) -> Table | None:
-    """Return the mean noise in bands of an octave or more, by the first method."""
+def band_tables(result: Result) -> list[Table]:
+    """Return the mean noise by every method, and by the first one in bands of an octave or more."""
     snapshot = result.snapshot
     bands = list(_octaves(known_range(snapshot)[0], float(snapshot.frequency[-2])))
-    if len(bands) < 2:
-        return None
-    method = next(iter(snapshot.results))
-    columns = [result.means(method, band) for band in bands]
-    rows = []
-    for number, label in enumerate(snapshot.channels):
-        row = [f"{label.sensor}.{label.channel}"]
-        for means in columns:
-            mean, low, high, _ = _only(means[number])
-            row.append(level_with_error(mean, high, low))
-        rows.append(tuple(row))
-    header = ("channel", *(span(*band) for band in bands))
-    title = f"Mean in wide bands with 95 % interval, dB re 1 ({snapshot.unit})²/Hz"
-    return Table(header, tuple(rows), title=title)
+    methods = {method: result.means(method) for method in snapshot.results}
+    octaves = {span(*band): result.means(result.method, band) for band in bands}
+    tables = ((f"Mean over {span(*result.band)} by every method", methods), (WIDE, octaves))
+    unit = f"dB re 1 ({snapshot.unit})²/Hz"
+    return [
+        Table(
+            ("channel", *columns),
+            tuple(
+                (label.name, *(_with_error(means[number]) for means in columns.values()))
+                for number, label in enumerate(snapshot.channels)
+            ),
+            title=f"{name}, {unit}",
+        )
+        for name, columns in tables
+        if len(columns) > 1
+    ]
+
+
+def _with_error(means: BandMeans) -> str:
+    mean, low, high = _only(means)
+    return level_with_error(mean, high, low)
 
 
 def _octaves(low: float, high: float) -> Iterator[tuple[float, float]]:
@@ -269,22 +268,3 @@ def _octaves(low: float, high: float) -> Iterator[tuple[float, float]]:
     step = -(-(last - first) // MAX_BANDS)
     for exponent in range(first, last, step):
         yield 2.0**exponent, 2.0 ** min(exponent + step, last)
-
-
-def _in_the_band(means: BandMeans) -> str:
-    mean, low, high, _ = _only(means)
-    return level_with_error(mean, high, low)
-
-
-def _methods_table(result: Result) -> Table:
-    snapshot, band = result.snapshot, result.band
-    columns = [result.means(method) for method in snapshot.results]
-    rows = tuple(
-        (
-            f"{label.sensor}.{label.channel}",
-            *(_in_the_band(means[number]) for means in columns),
-        )
-        for number, label in enumerate(snapshot.channels)
-    )
-    title = f"Mean over {span(*band)} by every method, dB re 1 ({snapshot.unit})²/Hz"
-    return Table(("channel", *snapshot.results), rows, title=title)

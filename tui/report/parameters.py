@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
 
-HEIGHT = 1.45
+HEIGHT = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class _AllanPanel:
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_ylim(self.scale)
         axes.set_xlabel("averaging time (s)")
-        axes.set_ylabel(f"Allan deviation ({self.unit})")
+        axes.set_ylabel(f"σ ({self.unit})")
 
 
 def parameters_section(result: Result) -> Section | None:
@@ -96,11 +96,10 @@ def parameters_section(result: Result) -> Section | None:
         parts.append(Items(tuple(Paragraph(line, "doubtful") for line in lines)))
     parts.append(
         Paragraph(
-            "The PSD of the noise is described by random walk (f⁻²), flicker (f⁻¹), white and f² "
-            "noise, fitted by weighted least squares to the estimate as it is. Quantisation: the "
-            "white noise of counting in whole numbers, part of the white term. The Allan deviation "
-            "is that of the sensor's own noise, without the motion, up to the highest frequency of "
-            "the estimate.",
+            "Random walk (f⁻²), flicker (f⁻¹), white and f² noise are fitted to the PSD of the "
+            "noise by weighted least squares. Quantisation: white noise of counting in whole "
+            "numbers, part of the white term. Allan deviation (σ): of the sensor's own noise, "
+            "without the motion, up to the highest frequency of the estimate.",
             "quiet",
         )
     )

@@ -18,6 +18,7 @@ from tui.page import drawing
 from tui.page.blocks import Paragraph, Part, Plot, Section, three_to_a_row
 from tui.page.table import Table
 from tui.report.figures.curves import logarithmic
+from tui.report.noise import band_tables
 from tui.wording.formatting import NOTHING, level, plain_number, scientific
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
     from daq.results.result import Result
     from estimator.types import FloatArray
 
-COLUMNS = 9
-"""Channels that one table is wide."""
+COLUMNS, MOST_LETTERS = 9, 108
+"""Channels that one table is wide, and letters of their names."""
 LEAST_SHARE = 1e-3
 """Of the level, from which a contribution has a row."""
 _NAMES = {"estimate": "finite averages"}
@@ -45,35 +46,14 @@ HALF = 2**0.25
 
 def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
     """Return level, contributions, total, and the noise in half octaves; None without a result."""
-    snapshot = result.snapshot
     found = band_budgets(result)
     if not found:
         return None
-    names = [f"{label.sensor}.{label.channel}" for label in snapshot.channels]
-    method, band, unit = result.method, span(*result.band), snapshot.unit
-    of_g, in_si = _ratio(unit, "g"), _ratio(unit, "m/s²")
-    rows = tuple(
-        (
-            name,
-            level(each.value),
-            _ends(_statistical(each)),
-            _ends(each.interval),
-            _percent(each.combined, ".2f"),
-            plain_number(each.k, ".2f"),
-            _percent(each.k * each.combined, ".2f"),
-            _root(each.value),
-            *((_root(each.value, of_g), _root(each.value, 1e6 * of_g)) if of_g else ()),
-            *((level(each.value * in_si**2),) if in_si and unit != "m/s²" else ()),
-        )
-        for name, each in zip(names, found, strict=True)
-    )
-    header: tuple[str, ...] = (
-        "channel", "noise (dB)", "statistical (dB)", "total (dB)", "u", "k", "U", f"({unit})/√Hz",
-    )  # fmt: skip
-    if of_g:
-        header += ("g/√Hz", "µg/√Hz")
-    if in_si and unit != "m/s²":
-        header += ("dB re 1 (m/s²)²/Hz",)
+    snapshot = result.snapshot
+    names = [label.name for label in snapshot.channels]
+    in_g, in_si = (_ratio(snapshot.unit, unit) for unit in ("g", "m/s²"))
+    if snapshot.unit == "m/s²":
+        in_si = None
     budget = tuple(
         (
             name, _NAMES.get(row.source) or SOURCE_WORDS[Source(row.source)],
@@ -91,21 +71,38 @@ def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
         f" {min(dof, default=0):.0f} to {max(dof, default=0):.0f} degrees of freedom; no other"
         f" contribution reaches {100 * LEAST_SHARE:g} % of the level.",
     )
+    is_only = bool(dof) and len(budget) == len(found)
+    header = (
+        "channel", "worst c.o.v.", *["statistical (dB)"] * (not is_only), "total (dB)",
+        "u", "k", "U", *["µg/√Hz"] * bool(in_g), *["dB re 1 (m/s²)²/Hz"] * bool(in_si),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            name,
+            plain_number(cov, ".3f"),
+            *([] if is_only else [_ends(_statistical(each))]),
+            _ends(each.interval),
+            _percent(each.combined, ".2f"),
+            plain_number(each.k, ".2f"),
+            _percent(each.k * each.combined, ".2f"),
+            *([_root(each.value, 1e6 * in_g)] if in_g else []),
+            *([level(each.value * in_si**2)] if in_si else []),
+        )
+        for name, each, cov in zip(names, found, result.covs_of(result.method), strict=True)
+    )
+    statistical = "" if is_only else "Statistical: by the scatter of the averages. "
     parts: list[Part] = [
-        Table(
-            header,
-            rows,
-            title=f"Mean over {band} by the {method} method, PSD in dB re 1 ({unit})²/Hz",
-        ),
+        *band_tables(result),
+        Table(header, rows, title=f"Uncertainty of the mean over {span(*result.band)}"),
         Paragraph(
-            "Intervals at 95 %. The statistical interval is that of the scatter of the averages. "
-            "The total has all of the budget, sensitivities included. u: combined standard "
-            "uncertainty of the PSD. U: half the width of the total interval. k = U / u. Every "
-            "section of this report, its JSON and its DCC state this U." + _not_stated(snapshot),
+            f"Intervals at 95 %. {statistical}Total: by all of the budget, sensitivities "
+            "included. Worst c.o.v.: of thirds of an octave. u: combined standard uncertainty of "
+            "the PSD. U: half the width of the total interval. k = U / u. Report, JSON and "
+            "DCC state this U." + _not_stated(snapshot),
             "quiet",
         ),
         only
-        if dof and len(budget) == len(found)
+        if is_only
         else Table(
             (
                 "channel", "contribution", "distribution", "−", "+", "standard uncertainty",
@@ -118,7 +115,7 @@ def uncertainty_section(result: Result, about: Bench | None) -> Section | None:
         ),
     ]  # fmt: skip
     parts += _half_octaves(result, about, names)
-    return Section("Uncertainty", tuple(parts))
+    return Section("Uncertainty, and noise in bands", tuple(parts))
 
 
 def half_octaves(frequency: FloatArray) -> tuple[FloatArray, list[NDArray[np.int64]]]:
@@ -151,7 +148,8 @@ def _half_octaves(result: Result, about: Bench | None, names: Sequence[str]) -> 
     parts: list[Part] = []
     if np.isfinite(full).any():
         parts += _diagrams(snapshot, centres, rms, full)
-    n_tables = math.ceil(len(names) / COLUMNS)
+    most = max(1, min(COLUMNS, int(MOST_LETTERS / max(map(len, names)))))
+    n_tables = math.ceil(len(names) / most)
     for columns in np.array_split(np.arange(len(names)), n_tables):
         some = slice(int(columns[0]), int(columns[-1]) + 1)
         parts.append(
@@ -182,10 +180,8 @@ def _half_octaves(result: Result, about: Bench | None, names: Sequence[str]) -> 
         Paragraph(
             "Half octaves about powers of √2, as strong-motion users state noise and range: rms of "
             "the noise in each, below the rms of a sine of full scale (Evans and others, 2010, "
-            "Seismol. Res. Lett. 81(4), with the erratum of 2012, 83(3), which corrects the "
-            "two- and three-instrument noise of their scripts; the noise here is not made by "
-            "them). Full scale as of the data sheet in the bench file; without it no range is "
-            "given.",
+            "Seismol. Res. Lett. 81(4); erratum 2012, 83(3)). Full scale as of the data sheet in "
+            "the bench file; without it no range is given.",
             "quiet",
         )
     )
@@ -268,7 +264,7 @@ def _ratio(unit: str, wanted: str) -> float | None:
     return size / one if size and one else None
 
 
-def _root(psd: float, factor: float = 1.0) -> str:
+def _root(psd: float, factor: float) -> str:
     return scientific(factor * math.sqrt(psd)) if psd > 0 else NOTHING
 
 
@@ -280,10 +276,12 @@ def _statistical(found: Budget) -> tuple[float, float]:
 
 def _not_stated(snapshot: Snapshot) -> str:
     """Return whose sensitivities are taken as exact, because nothing is stated of them."""
-    names = ", ".join(each.name for each in without_sensitivity(snapshot))
+    found = without_sensitivity(snapshot)
+    is_all = len(found) == len(snapshot.channels)
+    names = "all channels" if is_all else ", ".join(each.name for each in found)
     return (
         f" Without certificate or tolerance, and taken as exact: sensitivities of {names}."
-        if names
+        if found
         else ""
     )
 

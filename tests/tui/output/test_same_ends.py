@@ -32,7 +32,7 @@ from tui.output.json_document import _band_means
 from tui.output.results import result_table
 from tui.page.table import Table
 from tui.page.terminal import terminal_table
-from tui.report.noise import noise_section
+from tui.report.uncertainty import uncertainty_section
 from tui.web.chart import _numbers
 
 BAND = (9.0, 11.0)  # within one third of an octave: a limit there is judged in one band
@@ -121,10 +121,12 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
             assert bound is not None
             assert float(bound[1]) == pytest.approx(decibels(float(above)), abs=0.006)
 
-    section = noise_section(Result(snapshot, THIRD))
-    table = next(part for part in section.parts if isinstance(part, Table))
+    section = uncertainty_section(Result(snapshot, THIRD), None)
+    assert section is not None
+    _, table, *_ = (part for part in section.parts if isinstance(part, Table))
+    place = table.header.index("total (dB)")
     for row_, below, above in zip(table.rows, low, high, strict=True):
-        ends = [float(x) for x in re.findall(r"-?[\d.]+", row_[3].replace("−", "-"))]
+        ends = [float(x) for x in re.findall(r"-?[\d.]+", row_[place].replace("−", "-"))]
         expected = [decibels(float(above))] if below <= 0 else [*map(decibels, (below, above))]
         assert ends == pytest.approx(expected, abs=0.006)
 

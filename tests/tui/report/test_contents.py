@@ -40,7 +40,7 @@ from tui.report.evidence import (
     model_test_section,
 )
 from tui.report.figures.drift import without_line
-from tui.report.noise import noise_section
+from tui.report.noise import result_section
 from tui.report.parameters import parameters_section
 from tui.report.uncertainty import uncertainty_section
 
@@ -59,12 +59,12 @@ def test_it_says_what_was_tested_on_what_by_whom_and_when(reported: Reported) ->
 
 def test_noise_is_that_of_the_estimate(reported: Reported) -> None:
     # 100 counts of white noise at 100 Hz, 1e6 counts per m/s²: 2e-10 (m/s²)²/Hz, −97 dB
-    table, *_ = tables(reported.report, "Self-noise")
+    (table,) = tables(reported.report, "Result")
     rows = by_channel(table)
-    assert float(rows["A.X"][2].replace("−", "-")) == pytest.approx(-96.99, abs=0.5)
-    low, high = (float(end.replace("−", "-")) for end in rows["A.X"][3].split(" … "))
-    assert low < -96.99 < high
-    assert float(rows["B.X"][7]) == pytest.approx(10 * np.log10(4000**2 / 100**2), abs=0.6)
+    level, half = map(float, rows["A.X"][2].replace("−", "-").split(" ±"))
+    assert level == pytest.approx(-96.99, abs=0.5)
+    assert abs(level + 96.99) < half
+    assert float(rows["B.X"][4]) == pytest.approx(10 * np.log10(4000**2 / 100**2), abs=0.6)
     assert rows[f"{HOSTILE}.Y"][1:3] == ("no signal", "?")
 
 
@@ -72,17 +72,24 @@ def test_each_cell_of_the_noise_is_that_of_its_channel(reported: Reported) -> No
     def db(value: float, digits: int = 2) -> str:
         return f"{10 * np.log10(value):.{digits}f}".replace("-", "−")
 
-    table, *_ = tables(reported.report, "Self-noise")
-    result, rows = reported.result, list(by_channel(table).values())
+    (table,) = tables(reported.report, "Result")
+    _, uncertainty, *_ = tables(reported.report, "Uncertainty")
+    result, rows, sides = reported.result, by_channel(table), by_channel(uncertainty)
     covs = result.covs_of("three-sensor")
-    for column, own in enumerate(result.means("three-sensor")[:7]):  # the last channel is dead
+    assert uncertainty.header[1:6] == ("worst c.o.v.", "total (dB)", "u", "k", "U")
+    means = result.means("three-sensor")[:7]  # the last channel is dead
+    for label, own, data, cov in zip(
+        result.snapshot.channels, means, result.data, covs, strict=False
+    ):
         (mean,), (low,), (high,), (spread,) = own.mean, own.low, own.high, own.spread
-        data = float(result.data[column])
-        assert rows[column][1:4] == (db(data, 1), db(mean), f"{db(low)} … {db(high)}")
-        assert rows[column][4] == f"{1e5 * mean**0.5:.2f}×10⁻⁵"
-        numbers = f"{covs[column]:.3f}", f"{spread / mean:.3f}", db((data - mean) / mean, 1)
-        assert rows[column][5:] == numbers
-    assert 0 < spread / mean < covs[column] < 0.5
+        row, side = rows[label.name], sides[label.name]
+        assert row[1] == db(data, 1)
+        assert row[2].startswith(f"{db(mean)} ±")
+        assert float(row[2].partition("±")[2]) >= 10 * np.log10(high / mean) - 0.006
+        assert row[3:5] == (f"{1e5 * mean**0.5:.2f}×10⁻⁵", db((data - mean) / mean, 1))
+        assert side[1:3] == (f"{cov:.3f}", f"{db(low)} … {db(high)}")
+        assert float(side[3].removesuffix(" %")) == pytest.approx(100 * spread / mean, abs=0.01)
+    assert 0 < spread / mean < cov < 0.5
 
 
 @pytest.mark.usefixtures("empty_figures")
@@ -91,13 +98,14 @@ def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path)
     assert text.startswith("NOT DECIDED: whether 1 of 8 channels is below data sheet")
     assert f"{HOSTILE}.Y: no noise estimate at some frequencies" in text
     assert "Record for" not in text  # time does not bring the dead channel back
-    (table,) = tables(reported.report, "Verdict")
+    (table,) = tables(reported.report, "Result")
     rows = by_channel(table)
-    assert rows["A.X"][6] == "PASS"
-    margin, low, high = re.findall(r"[+−-][\d.]+", rows["A.X"][5])
+    assert rows["A.X"][9] == "PASS"
+    margin, low, high = re.findall(r"[+−-][\d.]+", rows["A.X"][8])
     assert float(margin) == pytest.approx(10, abs=2)
     assert 0 < float(low) < float(margin) < float(high)
-    assert rows[f"{HOSTILE}.Y"][6] == "no estimate"
+    assert rows[f"{HOSTILE}.Y"][9] == "no estimate"
+    assert list(rows)[:2] == [f"{HOSTILE}.Y", f"{HOSTILE}.X"]  # the worst sensor first
 
     failing = record(tmp_path / "noisy.h5", psd=5e-11)
     result = CliRunner().invoke(app, ["report", str(failing), "--out", str(tmp_path / "n.html")])
@@ -118,7 +126,8 @@ def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
             examined=tuple(sources([reported.recording])),
         )
     )
-    table, methods, _ = tables(report, "Self-noise")
+    (table,) = tables(report, "Result")
+    methods, *_ = tables(report, "Uncertainty")
     assert "by the three-sensor method" in table.title
     assert set(methods.header) >= {"three-sensor", "three-channel", "maximum-likelihood"}
     assert report.verdict.text == reported.report.verdict.text
@@ -131,7 +140,7 @@ def test_all_cells_of_two_methods_and_free_clocks_are_as_kept(share: float) -> N
     diagnostics = replace(made.diagnostics, synchronisation=known)
     result = Result(replace(made, diagnostics=diagnostics), SETTINGS)
     sections = (
-        noise_section(result), uncertainty_section(result, demo_bench()),
+        result_section(result), uncertainty_section(result, demo_bench()),
         parameters_section(result), model_test_section(result), alignment_section(result),
         clocks_section(result),
     )  # fmt: skip
@@ -149,7 +158,7 @@ def test_one_simulated_recording_makes_the_report_one_of_a_model(reported: Repor
 
 
 def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
-    (table,) = tables(reported.report, "What happened")
+    (table,) = tables(reported.report, "The recording against time")
     assert [row[0] for row in table.rows] == sorted(row[0] for row in table.rows)
     assert len(table.rows) == 5  # 240 events of four sensors and two gaps
     words = [row[3] for row in table.rows]
@@ -225,7 +234,7 @@ def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> N
     text = " ".join(texts_of(report))
     assert "night.h5" in text
     assert "second.h5" in text
-    assert f"{2 * reported.snapshot.n_segments} segments used" in text
+    assert f"Segments used {2 * reported.snapshot.n_segments}, n = " in text
 
 
 def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
@@ -253,14 +262,15 @@ def test_the_report_and_json_say_that_shared_noise_was_not_searched_for(
 def test_the_result_comes_first(reported: Reported) -> None:
     """The first curve was on page 3, after twelve lines of what is not given."""
     titles = [each.title for each in reported.report.sections]
-    assert titles[:3] == ["Verdict against the limits", "Self-noise", "Facts"]
-    table, plot, *_ = reported.report.sections[1].parts
+    assert titles[:2] == ["Result", "Facts"]
+    table, untraceable, plot, *_ = reported.report.sections[0].parts
     assert isinstance(table, Table)
+    assert "No statement of conformity" in str(untraceable)
     assert isinstance(plot, Plot)
     text = Words(reported.page).text
     assert text.index("NOT DECIDED") < text.index("DRAFT: not a certificate")
-    assert sum("not given" in each.text for each in reported.report.notices) == 0
-    assert sum(each.text.startswith("Not given: ") for each in reported.report.notices) == 1
+    (draft,) = (each.text for each in reported.report.notices if "Not given" in each.text)
+    assert draft.endswith("Not given: 8 of its 10 entries; see the annex.")
 
 
 def test_long_names_of_sensors_have_rows_of_their_own(reported: Reported) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +140,37 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
         assert places
         right, top = float(page.mediabox.right), float(page.mediabox.top)
         assert all(0 < x < right and 0 < y < top for x, y in places)
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_pass_of_two_minutes_has_its_result_on_page_one_and_four_pages(tmp_path: Path) -> None:
+    """Nine channels of three sensors. There were 6 pages, and two tables of results."""
+    limit = '[[limits]]\nname = "sheet"\nfrequency = [1, 50]\npsd = [1.6e-11, 1.6e-11]\n'
+    written = files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
+    bench, recording, out = (tmp_path / name for name in ("b.toml", "b.h5", "b.pdf"))
+    bench.write_text(written.replace("[recording]", f"{limit}[recording]"), encoding="utf-8")
+    run = CliRunner()
+    simulated = run.invoke(app, ["simulate", str(bench), "-d", "2min", "--out", str(recording)])
+    assert simulated.exit_code == 0, simulated.output
+    assert run.invoke(app, ["report", str(recording), "--out", str(out)]).exit_code == 0
+    first, second, *others = (page.extract_text() for page in PdfReader(out).pages)
+    assert len(others) <= 2
+    assert "PASS: all 9 channels are below sheet." in first
+    assert first.count("< 0.01 %") == 9
+    assert "nothing can be said." in first  # the last words of the section
+    assert "\n2   Facts\n" in second
+
+
+def test_axes_above_others_have_labels_if_a_page_ends_between_them() -> None:
+    def panel(axes: Axes) -> None:
+        axes.set_xlabel("time (s)")
+
+    plots = [Plot("", (panel,), 1, 2.5, "a plot", is_continued=n < 5) for n in range(6)]
+    section = Section("One", tuple(plots))
+    report = Report("Plots", "", Paragraph("drawn"), (section,))
+    pages = [page.extract_text() for page in PdfReader(paper_of(report)).pages]
+    assert len(pages) == 2
+    assert [text.count("time (s)") for text in pages] == [1, 1]
 
 
 def test_curves_are_paths_where_the_axes_have_them() -> None:

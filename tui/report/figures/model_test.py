@@ -60,7 +60,7 @@ def model_test_plot(result: Result) -> Plot | None:
         (partial(_draw_test, centre, ratio, limit, span),),
         n_columns=1,
         height=TEST_HEIGHT,
-        key_rows=1,
+        key_rows=1 + bool((ratio > limit).any()),
         alt="Statistic of the model test over its expectation against frequency",
     )
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
 COARSE = 24, 30
 """Times and bands on a page: no picture is in it."""
-TRACE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.7
-"""Of each waveform and each spectrogram, in inches."""
+TRACE_HEIGHT, COARSE_HEIGHT, SPECTRUM_HEIGHT = 0.36, 0.24, 0.7
+"""Of each waveform, of each with few spectrograms, and of each spectrogram, in inches."""
 MOST_HEIGHT = 8.0
 """Of all waveforms: they fit on a page."""
 _COLOURS = {GAP: drawing.LIMIT, CLIPPED: drawing.LINES[1], EXCLUDED: drawing.INK}
@@ -64,11 +64,12 @@ def signal_plots(
     """
     begin, end = span or signal.span
     view = signal.view(begin, end, COLUMNS, signal.excluded(snapshot, exclude))
-    height = min(TRACE_HEIGHT * (len(view.traces) + 0.7), MOST_HEIGHT)
+    each = TRACE_HEIGHT if most_spectra is None else COARSE_HEIGHT
+    height = min(each * (len(view.traces) + 0.7), MOST_HEIGHT)
     alt = f"Waveforms of {len(view.traces)} channels, {title(view)}"
     draw = partial(_draw_waveforms, view)
     recorded = "Recorded, simulated" if signal.recording.simulated else "Recorded"
-    plots = [Plot(f"{recorded}, {title(view)}", (draw,), 1, height, alt)]
+    plots = [Plot(f"{recorded}, {title(view)}", (draw,), 1, height, alt, right=0.5)]
     main = [(n, trace) for n, trace in enumerate(view.traces) if not trace.is_auxiliary]
     for number, trace in main[:most_spectra]:
         found = _spectra(
@@ -117,9 +118,8 @@ def _draw_waveforms(view: Waveforms, axes: Axes) -> None:
             linewidth=0.4,
         )
     for row, trace in enumerate(view.traces):
-        place = 0.998, _CYCLE - row
         across = "axes fraction", "data"
-        axes.annotate(extent(trace), place, xycoords=across, ha="right", va="bottom", size=5)
+        axes.annotate(extent(trace), (1.005, -row), xycoords=across, va="center", size=5)
     for mark in view.marks:
         _draw_mark(axes, mark, (view.end - view.begin) / view.n_columns)
     remarks = [mark for mark in view.marks if mark.kind == EventKind.MARK]

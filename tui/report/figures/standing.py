@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from daq.results.result import Result
 
-COLUMNS, SKETCH_HEIGHT, COHERENCE_HEIGHT = 6, 0.85, 1.0
+COLUMNS, SKETCH_HEIGHT, COHERENCE_HEIGHT = 8, 0.85, 1.0
 _MOST_PAIRS = 15
 _LEAST_LOSS = 1e-5
 """Of the vertical scale: what two sensors do not share."""
@@ -41,17 +41,23 @@ def standing_plots(result: Result) -> list[Plot]:
     if coherence is not None:
         names = result.snapshot.sensor_names
         draw = partial(_draw_coherence, coherence, names)
-        rows = -(-min(len(coherence.pairs), _MOST_PAIRS) // 6)
+        widest = max(map(len, names))
+        in_a_row = max(1, int(1.8 / (0.3 + 0.055 * (2 * widest + 2))))  # of the key, in inches
+        rows = -(-min(len(coherence.pairs), _MOST_PAIRS) // in_a_row)
         alt = "Coherence of every pair of sensors against frequency"
         plots.append(Plot(_TITLE, (draw,), 1, COHERENCE_HEIGHT, alt, key_rows=rows))
         low, high = result.band
         title = f"Coherence of pairs, mean over {low:.3g} to {high:.3g} Hz"
         height = 0.17 * len(names) + 0.1
-        plots.append(Plot(title, (partial(_draw_matrix, coherence, names),), 2, height, title))
+        cell = max(0.36, 0.06 * widest + 0.1)
+        columns = max(1, int(drawing.WIDTH / (cell * len(names) + 0.67)))
+        plots.append(
+            Plot(title, (partial(_draw_matrix, coherence, names),), columns, height, title)
+        )
     return plots
 
 
-_TITLE = "What pairs of sensors do not share: one minus their coherence, in the worst direction"
+_TITLE = "What pairs do not share, in the worst direction"
 
 
 def _draw_axes(stance: Stance, axes: Axes) -> None:
