@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimator.decision.comparison import Comparison, joint_quantile, prediction, whole
+from estimator.decision.comparison import Comparison, joint_quantile, mask_edges, prediction, whole
 from estimator.decision.verdict import Obstacle, Verdict
 
 QUANTILE = joint_quantile(3)
@@ -134,3 +134,15 @@ def test_an_uncertain_sensitivity_takes_time_by_squares_and_no_time_decides_besi
 def test_more_bands_take_wider_intervals() -> None:
     assert joint_quantile(1) == pytest.approx(1.96, abs=0.001)
     assert joint_quantile(81) > 3.4
+
+
+@pytest.mark.parametrize(
+    ("points", "lowest"), [((200.0, 300.0), 0.0), ((1.0, 50.0), 60.0), ((1.0, 50.0), 50.0)]
+)
+def test_a_mask_outside_of_what_is_known_has_no_bands(
+    points: tuple[float, float], lowest: float
+) -> None:
+    """Nor has one whose last frequency is the first that is known."""
+    frequency = np.arange(101, dtype=np.float64)
+    edges = mask_edges(frequency, np.ones(101), np.array(points), known=(lowest, math.inf))
+    assert edges.shape == (0,)
