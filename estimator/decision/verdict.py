@@ -72,20 +72,20 @@ class Prediction:
         limit.
     slowest : int
         Which of the channels beside their limits takes longest to pass, or fails first.
-    frequency : float
-        Centre of the band where it does, in Hz.
     is_pass : bool
         Whether it is rather a pass that decides.
+    frequency : float
+        Centre of the band where it does, in Hz.
     """
 
     seconds: float | None
     longest: float
     resolution_db: float
-    earliest: float | None = None
-    latest: float | None = None
-    slowest: int = 0
+    earliest: float | None
+    latest: float | None
+    slowest: int
+    is_pass: bool
     frequency: float = math.nan
-    is_pass: bool = True
 
     @property
     def is_close(self) -> bool:
