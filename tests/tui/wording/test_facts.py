@@ -25,7 +25,7 @@ from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
 from daq.results.sources import sources
 from estimator.checks.advice import Advice, Rank
-from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import assert_as_kept
 from tests.tui.wording.advice_examples import MISFIT
@@ -79,6 +79,33 @@ def test_all_words_of_all_kinds_are_as_kept() -> None:
         if each
     )
     assert_as_kept(lines, Path(__file__).parent / "words.txt")
+
+
+def test_the_facts_of_made_results_are_as_kept() -> None:
+    whole = diagnosed()
+    (noise, *_) = whole.results.values()
+    refused = {"maximum-likelihood": "expected what is not there"}
+    clocks = (replace(whole.clocks[0], refined=False, drifts=True), *whole.clocks[1:])
+    made = {
+        "whole": whole,
+        "few averages": made_snapshot(n_effective=6.0),
+        "clocks that matter": made_snapshot(clock_share=0.3),
+        "a clock that drifts": replace(whole, clocks=clocks),
+        "nothing yet": empty_snapshot(),
+        "two channels": replace(
+            whole, results={"two-channel": replace(noise, method="two-channel")}
+        ),
+        "young": replace(empty_snapshot(), refused=refused, elapsed=1.0),
+        "refused while it runs": replace(made_snapshot(), refused=refused),
+        "refused, old, none": replace(whole, results={}, refused=refused, closed=False),
+        "refused, none": replace(whole, results={}, refused=refused),
+    }
+    lines = (
+        f"{name}: {fact.rank}, {fact.name}: {fact.words.line}"
+        for name, snapshot in made.items()
+        for fact in Result(snapshot, SETTINGS).facts
+    )
+    assert_as_kept(lines, Path(__file__).parent / "facts.txt")
 
 
 def test_the_model_passes_only_where_every_clock_is_understood() -> None:
