@@ -178,7 +178,7 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield what the methods assume, and where they give nothing."""
     advice, found = snapshot.diagnostics.advice, snapshot.diagnostics.diagnosis
     limit, highest = known_range(snapshot)[1], float(snapshot.frequency[-1])
-    if limit < highest:
+    if 0 < limit < highest:  # 0 before the first segment
         yield NoEstimateAbove(rank=Rank.TO_KNOW, band=(limit, highest))
     if (n := len(snapshot.channels)) > MAX_CHANNELS:
         yield SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=n, most=MAX_CHANNELS)

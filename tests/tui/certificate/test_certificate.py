@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import sqlite3
 import stat
 import sys
@@ -353,6 +354,27 @@ def test_no_certificate_is_issued_of_what_verify_refuses(
     assert refused.exit_code == 2, refused.output
     assert said in " ".join(refused.stderr.split())
     assert not made.certificates.exists()
+
+
+def test_only_closed_recordings_are_certified(tmp_path: Path) -> None:
+    recording, killed = tmp_path / "night.h5", tmp_path / "killed.h5"
+    said = []
+
+    def issue(path: Path) -> None:
+        refused = CliRunner().invoke(app, ["issue", str(path), "--by", "Ada", "--despite", "x"])
+        assert refused.exit_code == 2
+        said.append(" ".join(refused.stderr.split()))
+
+    def before_end() -> None:
+        shutil.copyfile(recording, killed)
+        issue(recording)
+
+    record(recording, before_end=before_end)
+    issue(killed)
+    growing, left = said
+    assert f"{recording}: not closed; wait for its end" in growing
+    assert f"{killed}: not closed; huddle repair closes it" in left
+    assert not (tmp_path / "certificates").exists()
 
 
 def test_no_revision_is_issued_of_a_recording_changed_since_its_certificate(

@@ -198,6 +198,13 @@ def rows_under_the_heads(made: Signed) -> None:
         rows.commit()
 
 
+def heads_without_a_key(made: Signed) -> None:
+    with closing(sqlite3.connect(made.lab.certificates / NAME)) as rows:
+        rows.executescript(DROP)
+        rows.execute("UPDATE heads SET key = 'none'")
+        rows.commit()
+
+
 def unsigned(made: Signed) -> None:
     stripped(made.certificate)
     rewrite(made.lab.certificates, with_hash_of(made.certificate))
@@ -282,6 +289,7 @@ def appended(made: Signed) -> None:
 FORGERIES: dict[Callable[[Signed], None], str] = {
     another_authoriser: "the ledger has another row for it than the one it names",
     rows_under_the_heads: "is not the one that was signed",
+    heads_without_a_key: "is not the one that was signed",
     unsigned: "was removed",
     of_the_same_name: "in the ledger with",
     swapped: "under the name of",

@@ -42,6 +42,14 @@ def test_limits_come_before_the_precision_and_what_ends_the_test_before_both() -
     assert left(verdict=False, target=None) == Remaining(None)
 
 
+def test_a_test_ends_by_its_precision_where_that_is_asked_for() -> None:
+    result = Result(SNAPSHOT, FREE)
+    cov = result.precision().cov
+    assert result.is_reached(EndCondition(cov=1.01 * cov))
+    assert not result.is_reached(EndCondition(cov=0.99 * cov))
+    assert not result.is_reached(NEVER)
+
+
 def test_the_channel_that_decides_last_is_named_with_its_frequency() -> None:
     found = left()
     assert found.seconds is not None
