@@ -260,14 +260,18 @@ def diagnose(
     frequency = check_frequency(frequency, len(csm))
     pairs = tuple(combinations(range(len(dims)), 2))
     coherence = np.stack(
-        [_least(matched_coherence(given.matrix, dims, j, k)) for j, k in pairs], axis=1
+        [
+            np.where(given.valid, _least(matched_coherence(given.matrix, dims, j, k)), np.nan)
+            for j, k in pairs
+        ],
+        axis=1,
     )
     there = presence(given, dims)
     part = given.part(list(there.channels))
     condition = np.full((len(csm), len(pairs)), np.nan)
     for one, two in combinations(range(len(there.sensors)), 2):
         pair = pairs.index((there.sensors[one], there.sensors[two]))
-        condition[:, pair] = _condition(part.matrix, there.dims, one, two)
+        condition[given.valid, pair] = _condition(part.matrix[given.valid], there.dims, one, two)
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     maxima = maxima or Maxima()

@@ -74,6 +74,16 @@ def test_a_good_bench_gets_no_warning() -> None:
     assert [band.test.p_value > 0.001 for band in found.bands].count(False) == 0
 
 
+def test_frequencies_without_averages_do_not_count_in_their_band() -> None:
+    """A linear trend, taken off, leaves none of four bins: "condition number inf" was said."""
+    csm = averages(bench(np.eye(3), np.eye(3), np.eye(3)))
+    whole = of(csm).bands[0]
+    csm[: whole.n_frequencies // 2 + 1] = np.nan
+    found = of(csm).bands[0]
+    assert found.condition == pytest.approx(whole.condition, rel=0.1)
+    assert found.coherence == pytest.approx(whole.coherence, rel=0.1)
+
+
 def elsewhere(sensor: int, *, n_sensors: int = 3, snr: float = 100.0) -> ComplexArray:
     """Sensors on one floor, but for one that stands on another and moves as much."""
     csm = snr * np.kron(np.ones((n_sensors, n_sensors)), np.diag([1.0, 1.5, 0.8]))
