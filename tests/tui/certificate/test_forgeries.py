@@ -423,6 +423,7 @@ def test_an_unsigned_certificate_is_not_what_a_key_asks_for(
     code, said = issued.verify(issued.certificate())
     assert code == 0
     assert "not signed: who can write the folder can write certificate and ledger anew" in said
+    assert f"recording {issued.recording}: the one certified, unchanged" in said  # it is beside
     code, said = issued.verify(issued.certificate(), "--key", signing.public)
     assert code == 3
     assert "it is not signed" in said
