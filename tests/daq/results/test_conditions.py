@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from daq.bench.loading import parse
-from daq.protocols.block import HostTime, Quantity
+from daq.protocols.block import EventKind, HostTime, Quantity
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
-from daq.results.sources import conditions, sources
+from daq.results.sources import LoggedEvent, conditions, sources, with_uncounted
 
 START = datetime(2026, 11, 25, 12, tzinfo=UTC)
 BENCH = """
@@ -71,3 +71,15 @@ def test_an_older_recording_has_the_temperature_at_its_start(tmp_path: Path) -> 
     found = sources([written(tmp_path / "r.h5", temperature=21.5)])
     a, b = conditions(found)
     assert (a.lowest, a.highest, a.n_readings, b.sensor) == (21.5, 21.5, 1, "b")
+
+
+def test_lost_samples_of_an_estimate_take_the_place_of_those_recorded_of_the_same_sensor() -> None:
+    kind = EventKind.UNCOUNTED
+    recorded = [
+        LoggedEvent(3, "A", kind, "recorded"), LoggedEvent(1, "A", EventKind.CONNECTED, "hello"),
+        LoggedEvent(2, "B", kind, "recorded"),
+    ]  # fmt: skip
+    found = with_uncounted(recorded, [LoggedEvent(4, "A", kind, "estimated")])
+    assert [(e.utc_ns, e.sensor, e.text) for e in found] == [
+        (1, "A", "hello"), (2, "B", "recorded"), (4, "A", "estimated"),
+    ]  # fmt: skip
