@@ -354,7 +354,6 @@ class Server:
         made = Starlette(
             routes=[*routes, static, every], exception_handlers=handlers, lifespan=self._lifespan
         )
-        made.router.redirect_slashes = False
         return Guard(made, self._access, place)
 
     async def _nothing(self, _request: Request) -> Response:
