@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from textual.css.model import RuleSet
@@ -14,6 +15,8 @@ from textual.css.parse import parse
 from textual.css.tokenize import tokenize_values
 from textual.css.tokenizer import Token
 from textual.css.types import CSSLocation
+
+from tests.tui.example_snapshot import ProgressCallback, demo_bench
 
 _tokens: dict[frozenset[tuple[str, str]], dict[str, list[Token]]] = {}
 _rules: dict[tuple[object, ...], list[RuleSet]] = {}
@@ -49,6 +52,11 @@ def _parsed(
             )
         )
     return _rules[key]
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> ProgressCallback:
+    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
 
 
 @pytest.fixture(autouse=True)

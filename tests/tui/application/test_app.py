@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +47,28 @@ async def shown(pilot: Pilot[None], app: HuddleApp, *messages: Message) -> None:
         app.post_message(message)
     for _ in range(4):
         await pilot.pause()
+
+
+async def settled(pilot: Pilot[None], app: HuddleApp) -> None:
+    """Wait until workers have ended and what they found has been drawn."""
+    await app.workers.wait_for_complete()
+    await shown(pilot, app)
+
+
+async def pressed(pilot: Pilot[None], app: HuddleApp, *keys: str) -> str:
+    """Press keys, and return the screen once it has been drawn."""
+    await pilot.press(*keys)
+    await shown(pilot, app)
+    return screen_text(app)
+
+
+@asynccontextmanager
+async def opened(
+    app: HuddleApp, *, size: tuple[int, int], notifications: bool = False
+) -> AsyncIterator[tuple[HuddleApp, Pilot[None]]]:
+    """Run an application on a terminal of some size."""
+    async with app.run_test(size=size, notifications=notifications) as pilot:
+        yield app, pilot
 
 
 def view(app: App[None]) -> TestView:
@@ -105,8 +129,7 @@ def unfolded(app: HuddleApp) -> str:
 async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW, notifications=True) as pilot:
+    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
         await pilot.press("s", "enter")
         await app.workers.wait_for_complete()
         await pilot.pause()
@@ -119,16 +142,14 @@ async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
 
 async def test_a_running_recording_is_found_again(told: ProgressCallback, tmp_path: Path) -> None:
     told.running = tmp_path / "old.h5"
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.pause()
         assert "old.h5" in unfolded(app)
 
 
 async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         both = ("three-sensor", "three-channel")
         assert view(app).choice.methods == both
@@ -143,8 +164,7 @@ async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> N
 
 
 async def test_trouble_is_told(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW, notifications=True) as pilot:
+    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
         await shown(pilot, app, ErrorReported("sensor B at /dev/ttyUSB1: no answer"))
         text = screen_text(app)
     assert "no answer" in text
@@ -167,8 +187,7 @@ async def test_the_result_comes_by_itself_and_its_report_on_request(
 
 
 async def test_quitting_tells_the_recorder_nothing(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         await pilot.press("q")
     assert told.told == []
@@ -201,17 +220,13 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
         board = screen_text(app)
         assert all(name in board for name in sensors)
         assert f"{sensors[0]} X " in board
-        await pilot.press("c")
-        await shown(pilot, app)
+        await pressed(pilot, app, "c")
         assert f"clock of {sensors[0]}" in screen_text(app)
-        await pilot.press("d")
-        await shown(pilot, app)
-        text = screen_text(app)
+        text = await pressed(pilot, app, "d")
         assert f"/dev/{sensors[0]}" in text
         assert f"{sensors[2]} [/dropped]" in text
         assert f"{sensors[0]} → {sensors[1]}" in text
-        await pilot.press("escape", "3")
-        await shown(pilot, app)
+        await pressed(pilot, app, "escape", "3")
         result = screen_text(app)
         assert all(f"{name}.X" in result for name in sensors)
         assert f"two-channel: {sensors[1]} is third" in result
@@ -223,8 +238,7 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
     told.bench = demo_bench()
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-idle")
@@ -239,17 +253,14 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await pilot.press("down")
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-running")
-        await pilot.press("c")
-        await shown(pilot, app)
+        await pressed(pilot, app, "c")
         await assert_looks_as_before(pilot, f"{name}-clocks")
-        await pilot.press("c", "d")
-        await shown(pilot, app)
+        await pressed(pilot, app, "c", "d")
         await assert_looks_as_before(pilot, f"{name}-details")
         await pilot.press("escape")
         await shown(pilot, app, *ended())
         await assert_looks_as_before(pilot, f"{name}-result")
-        await pilot.press("2")
-        await shown(pilot, app)
+        await pressed(pilot, app, "2")
         await assert_looks_as_before(pilot, f"{name}-ended")
         assert screen_text(app).splitlines()[-1].endswith("q Quit")  # the longest line of keys
         await pilot.press("question_mark")
@@ -265,8 +276,7 @@ async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) 
     cumulants[0, 20:60, 0] = 1e-24
     changed = SelfNoise.of(noise.method, psd, cumulants, noise.flags)
     snapshot = replace(snapshot, results={"three-sensor": changed})
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await shown(
             pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
         )
@@ -279,12 +289,10 @@ async def test_without_colours_everything_is_there(
     told: ProgressCallback, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         text = screen_text(app)
-        await pilot.press("c")
-        await shown(pilot, app)
+        await pressed(pilot, app, "c")
         assert "clock drift" in screen_text(app)
     for said in (
         "● live",
@@ -307,8 +315,7 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Progress
             replace(third, state=SensorState.LIVE, stuck=("Y",)),
         ),
     )
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(
             pilot, app, StatusUpdated(worse), SnapshotReady(Result(made_snapshot(), SETTINGS))
         )
@@ -329,8 +336,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
 ) -> None:
     settings = replace(SETTINGS, target_cov=target)
     snapshot = made_snapshot()
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         live = tuple(replace(sensor, state=SensorState.LIVE) for sensor in made_now().sensors)
         now = replace(made_now(), sensors=live, until=EndCondition(200.0))
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, settings)))
@@ -345,8 +351,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         await pilot.press("question_mark")
         await shown(pilot, app, *running(n_effective=500))

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 from textual.pilot import Pilot
@@ -39,7 +40,7 @@ def bench(tmp_path: Path) -> Iterator[Path]:
         yield path
 
 
-async def until(pilot: Pilot[None], reached: Callable[[], bool]) -> None:
+async def until(pilot: Pilot[Any], reached: Callable[[], bool]) -> None:
     """Let the application run until something is the case."""
     deadline = time.monotonic() + limit()
     while not reached():

@@ -18,7 +18,7 @@ from daq.devices.bench_file import load
 from daq.devices.interface import DeviceInformation
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, WIDE, shown
+from tests.tui.application.test_app import NARROW, WIDE, opened, pressed, settled, shown
 from tests.tui.application.test_attach import until
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench
 from tests.waiting import limit
@@ -81,8 +81,7 @@ async def live(told: ProgressCallback, *sensors: SensorPreview) -> Reading:
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
     reading = await live(told)
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         await shown(pilot, app)
@@ -98,14 +97,11 @@ async def test_limits_are_changed_in_a_form_also_those_of_a_file(tmp_path: Path)
     path.write_text(f"# mine\n{demo_bench().text}", encoding="utf-8")
     (tmp_path / "sheet.csv").write_text("frequency (Hz), noise (µg/√Hz)\n1, 3\n30, 2\n")
     bench = load(path)
-    app = HuddleApp(BenchControls(path, bench, SETTINGS))
-    async with app.run_test(size=NARROW) as pilot:
-        await pilot.press("l", "tab", "tab", *"sheet.csv")
-        await shown(pilot, app)
+    async with opened(HuddleApp(BenchControls(path, bench, SETTINGS)), size=NARROW) as (app, pilot):
+        await pressed(pilot, app, "l", "tab", "tab", *"sheet.csv")
         assert "decided, " in screen_text(app)
         await pilot.press("enter")
-        await app.workers.wait_for_complete()
-        await shown(pilot, app)
+        await settled(pilot, app)
         assert app.state.bench is not None
         assert [limit.name for limit in app.state.bench.limits] == ["sheet"]
         await pilot.press("l", "tab", "tab", "end", *";nlnm", "enter")
@@ -137,8 +133,7 @@ async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(
     dead[:, 1] = 1.0
     gone = replace(c, samples=c.samples[:0], trouble="sensor 'C' on /dev/ttyUSB2: no answer")
     reading = await live(told, replace(a, samples=dead), replace(b, is_clipping=True), gone)
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         await shown(pilot, app)
@@ -158,30 +153,25 @@ async def test_the_ports_are_released_before_a_test_and_with_the_view(
     told: ProgressCallback, key: str
 ) -> None:
     reading = await live(told)
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         await shown(pilot, app)
-        await pilot.press(key, *(["enter"] if key == "s" else []))
-        await shown(pilot, app)
+        await pressed(pilot, app, key, *(["enter"] if key == "s" else []))
         assert reading.is_over.wait(limit())
 
 
 async def test_reading_goes_on_under_help_and_after_a_dialog(told: ProgressCallback) -> None:
     reading = await live(told)
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         for opens in ("question_mark", "ctrl+p"):
-            await pilot.press(opens)
-            await shown(pilot, app)
+            await pressed(pilot, app, opens)
             assert not reading.is_over.is_set()
             await pilot.press("escape")
         again = await live(told)
-        await pilot.press("s")
-        await shown(pilot, app)
+        await pressed(pilot, app, "s")
         assert reading.is_over.wait(limit())
         assert "● live" not in screen_text(app)
         await pilot.press("escape")
@@ -200,26 +190,22 @@ def test_a_silent_or_frozen_sensor_is_not_called_live() -> None:
 
 async def test_frozen_traces_stay(told: ProgressCallback) -> None:
     reading = await live(told)
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         await shown(pilot, app)
-        await pilot.press("f")
-        await shown(pilot, app)
+        await pressed(pilot, app, "f")
         assert "frozen: f goes on" in screen_text(app)
 
 
 async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
 
         async def press(*keys: str) -> str:
             await pilot.press(*keys)
-            await app.workers.wait_for_complete()
-            await shown(pilot, app)
+            await settled(pilot, app)
             return " ".join(screen_text(app).split())
 
         assert "No such" not in await press("a")
@@ -284,8 +270,7 @@ async def test_what_certificates_say_is_asked_for_checked_and_kept_in_the_bench_
                 app.screen.query_one(f"#{name}", Input).value = value
             app.screen.query_one(f"#{next(iter(values))}", Input).focus()
             await pilot.press("end", "enter")
-            await app.workers.wait_for_complete()
-            await shown(pilot, app)
+            await settled(pilot, app)
             return " ".join(screen_text(app).split())
 
         await pilot.press("c")
@@ -337,20 +322,16 @@ async def test_hum_is_seen_in_spectra_beside_noise_models_before_a_test(
     at = np.arange(len(a.samples)) / rate
     hum = 1e-3 * np.sin(2 * np.pi * 50 * at)[:, None]
     reading = await live(told, a, replace(b, samples=b.samples + hum), c)
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await pilot.press("p")
         reading.begun.wait(limit())
         await shown(pilot, app)
-        await pilot.press("g")
-        await shown(pilot, app)
-        text = screen_text(app)
+        text = await pressed(pilot, app, "g")
         assert "NHNM" in text
         assert "NLNM" in text
         assert "● live" in text  # the states of the sensors stay
         assert "last 10 s" not in text
-        await pilot.press("g")
-        await shown(pilot, app)
+        await pressed(pilot, app, "g")
         assert "last 10 s" in screen_text(app)
     drawn = {each.label: each for each in spectra(reading.sensors, SITES)}
     near = np.abs(10 ** drawn["A"].log_frequency - 50) < 1

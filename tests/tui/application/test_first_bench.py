@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -25,6 +24,7 @@ from daq.estimation.settings import Settings
 from daq.preflight.device_check import DiscoveredDevice, network_ports
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+from tests.tui.application.test_attach import until
 from tests.tui.example_snapshot import demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
@@ -309,11 +309,3 @@ async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
 def certificates(folder: Path) -> int:
     """Return how many certificates have been made."""
     return len(list(folder.rglob("*.pdf")))
-
-
-async def until(pilot: Pilot[Any], reached: Callable[[], bool]) -> None:
-    """Let the application run until something is the case."""
-    deadline = time.monotonic() + limit()
-    while not reached():
-        assert time.monotonic() < deadline, screen_text(pilot.app)
-        await pilot.pause(0.05)

@@ -18,7 +18,7 @@ from daq.recording.sensor_state import SensorState
 from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
-from tests.tui.application.test_app import NARROW, ended, running, shown
+from tests.tui.application.test_app import NARROW, ended, opened, pressed, running, settled, shown
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
@@ -36,11 +36,6 @@ from tui.commands.tui_controls import BenchControls, announce
 from tui.wording.verdict_text import WORDS
 
 LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
-
-
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
 
 
 @pytest.mark.parametrize(
@@ -64,23 +59,19 @@ def test_what_is_no_end_is_refused_with_what_was_expected(text: str) -> None:
 
 
 async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
-        await pilot.press("s")
-        await shown(pilot, app)
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+        await pressed(pilot, app, "s")
         for key in (*"ann", "tab", *"hot", "tab"):  # in one burst, as from a serial line
             app.post_message(Key(key, "\t" if key == "tab" else key))
         await shown(pilot, app)
         entry = app.screen.query_one("#end")
         entry.value = "decided"  # type: ignore[attr-defined]
-        await pilot.press("enter")
-        await shown(pilot, app)
+        await pressed(pilot, app, "enter")
         assert "the bench file has no limits" in screen_text(app)
         assert told.told == []
         entry.value = "10 %"  # type: ignore[attr-defined]
         await pilot.press("enter")
-        await app.workers.wait_for_complete()
-        await shown(pilot, app)
+        await settled(pilot, app)
     assert told.plan is not None
     assert told.plan.note == "hot"
     assert told.plan.end == EndCondition(cov=0.1)
@@ -107,10 +98,8 @@ async def test_with_limits_a_test_usually_ends_when_they_are_decided(
     told: ProgressCallback,
 ) -> None:
     told.bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
-        await pilot.press("s")
-        await shown(pilot, app)
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+        await pressed(pilot, app, "s")
         (line,) = [line for line in screen_text(app).splitlines() if " ends " in line]
         assert "decided" in line
 
@@ -160,8 +149,7 @@ def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -
 
 
 async def test_the_end_and_each_lost_sensor_are_announced_once(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         now = made_now()
         lost = replace(now.sensors[1], state=SensorState.DISCONNECTED, overdue_for=5.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from daq.bench.model import Limit
 from daq.results.band_summary import BandMeans
 from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, WIDE, running, shown, view
+from tests.tui.application.test_app import NARROW, WIDE, opened, pressed, running, shown, view
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
 from tui.application.state import State
@@ -32,11 +31,6 @@ from tui.application.test_view.plotted import (
     zoomed,
 )
 from tui.application.test_view.units import GRAVITY, SpectrumUnit, units_of
-
-
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
 
 
 def test_units_agree_with_their_definitions() -> None:
@@ -105,11 +99,9 @@ def test_lines_are_dots_in_the_cells_that_they_cross() -> None:
 
 
 async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await shown(pilot, app, *running())
-        await pilot.press("full_stop", "full_stop", "plus", "u", "u", "u")
-        await shown(pilot, app)
+        await pressed(pilot, app, "full_stop", "full_stop", "plus", "u", "u", "u")
         title = str(app.screen.query_one("#title", Static).render())
         choice = view(app).choice
         assert choice.cursor is not None
@@ -117,30 +109,23 @@ async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) 
         noise = 1e-12 / GRAVITY**2  # of A.X, in g²/Hz
         shown_noise = float(title.split("three-sensor ")[1].split(maxsplit=1)[0])
         assert shown_noise == pytest.approx(1e9 * math.sqrt(noise), rel=0.3)  # 100 averages
-        await pilot.press("escape")
-        await shown(pilot, app)
+        await pressed(pilot, app, "escape")
         assert "ng/√Hz" in screen_text(app)
         assert view(app).choice.span is None
-        await pilot.press("space", "right", "space", "down")
-        await shown(pilot, app)
-        text = screen_text(app)
+        text = await pressed(pilot, app, "space", "right", "space", "down")
         assert "A.X, A.Y, B.Y   noise in ng/√Hz" in text
         names = ("A.X", "A.Y", "B.Y")
         assert all(f"{m}  {name}" in text for m, name in zip("●×◆", names, strict=True))
-        await pilot.press("l")
-        await shown(pilot, app)
+        await pressed(pilot, app, "l")
         assert "A.X, A.Y, B.Y, C.Y   noise" in screen_text(app)
-        await pilot.press("l", "escape")
-        await shown(pilot, app)
+        await pressed(pilot, app, "l", "escape")
         assert "B Y   power spectral density in ng/√Hz" in screen_text(app)
 
 
 async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
-        await pilot.press("f")
-        await shown(pilot, app)
+        await pressed(pilot, app, "f")
         assert "c.o.v. 46 %" in screen_text(app)
         curves = screen_text(app).splitlines()[2:15]
         await shown(pilot, app, *running(n_effective=5000.0))
@@ -148,22 +133,18 @@ async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback)
         assert "frozen at 1:40" in text
         assert "c.o.v. 6.4 %" in text
         assert text.splitlines()[2:15] == curves
-        await pilot.press("f")
-        await shown(pilot, app)
+        await pressed(pilot, app, "f")
         assert "frozen" not in screen_text(app)
         assert screen_text(app).splitlines()[2:15] != curves
 
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await shown(pilot, app, *running())
-        await pilot.press("full_stop", "plus", "u", "t")
-        await shown(pilot, app)
+        await pressed(pilot, app, "full_stop", "plus", "u", "t")
         await assert_looks_as_before(pilot, f"{name}-test-cursor")
-        await pilot.press("escape", "l", "u", "u", "u", "e")
-        await shown(pilot, app)
+        await pressed(pilot, app, "escape", "l", "u", "u", "u", "e")
         await assert_looks_as_before(pilot, f"{name}-test-like")
 
 
@@ -198,8 +179,7 @@ def test_limits_and_noise_models_are_curves() -> None:
 
 
 async def test_noise_models_are_named_in_the_key(told: ProgressCallback) -> None:
-    app = HuddleApp(told, models=masks_named("nhnm,nlnm"))
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told, models=masks_named("nhnm,nlnm")), size=WIDE) as (app, pilot):
         await shown(pilot, app, *running())
         screen = screen_text(app)
     assert "NHNM" in screen
@@ -210,8 +190,7 @@ async def test_noise_models_are_named_in_the_key(told: ProgressCallback) -> None
 async def test_estimates_are_steps_with_whiskers_and_bins_by_a_key(
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await shown(pilot, app, *running(n_effective=500))
         state, choice = app.state, app.screen.choice  # type: ignore[attr-defined]
         for is_fine in (False, True):
@@ -228,11 +207,9 @@ async def test_estimates_are_steps_with_whiskers_and_bins_by_a_key(
         fine = next(each for each in zoomed if each.is_stepped)
         assert len(fine.log_frequency) >= 2 * len(steps.log_frequency)  # twelfths where they fit
         before = screen_text(app)
-        await pilot.press("b")
-        await shown(pilot, app)
+        await pressed(pilot, app, "b")
         assert screen_text(app) != before
-        await pilot.press("b")
-        await shown(pilot, app)
+        await pressed(pilot, app, "b")
         assert screen_text(app) == before
 
 
@@ -243,8 +220,7 @@ async def test_limits_are_drawn_apart_and_named_on_their_lines(told: ProgressCal
     )
     told.bench = demo_bench().model_copy(update={"limits": limits})
     for size in (NARROW, (120, 36), (200, 60)):
-        app = HuddleApp(told)
-        async with app.run_test(size=size) as pilot:
+        async with opened(HuddleApp(told), size=size) as (app, pilot):
             await shown(pilot, app, *running())
             found = curves(app.state, Choice(methods=("three-sensor",)), n_points=60)
             drawn = [each for each in found if each.name]

@@ -6,23 +6,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from textual.pilot import Pilot
 from textual.widgets import Input
 
 from daq.results.store import store_results
 from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, WIDE, shown
-from tests.tui.example_snapshot import ProgressCallback, demo_bench, growing, made_snapshot
+from tests.tui.application.test_app import NARROW, WIDE, opened, pressed, settled, shown
+from tests.tui.example_snapshot import ProgressCallback, growing, made_snapshot
 from tui.application.app import HuddleApp
 from tui.application.messages import CatalogueRead
 from tui.application.state import RECORDINGS
 from tui.runs.catalogue import Entry
-
-
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
 
 
 def entries(folder: Path) -> tuple[Entry, ...]:
@@ -45,29 +39,20 @@ def entries(folder: Path) -> tuple[Entry, ...]:
     )
 
 
-async def settled(pilot: Pilot[None], app: HuddleApp) -> None:
-    """Wait until the folder has been read and drawn."""
-    await app.workers.wait_for_complete()
-    await shown(pilot, app)
-
-
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(name: str, size: tuple[int, int], told: ProgressCallback) -> None:
     told.path = told.path.__class__("/bench/run.h5")  # as the pictures show it
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await pilot.press("4")
         await settled(pilot, app)
         app.screen.post_message(CatalogueRead(entries(told.folder)))
         await shown(pilot, app)
-        await pilot.press("down")
-        await shown(pilot, app)
+        await pressed(pilot, app, "down")
         await assert_looks_as_before(pilot, f"{name}-recordings")
 
 
 async def test_words_filter_and_escape_shows_all_again(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await pilot.press("4")
         await settled(pilot, app)
         app.screen.post_message(CatalogueRead(entries(told.folder)))
@@ -84,8 +69,7 @@ async def test_words_filter_and_escape_shows_all_again(told: ProgressCallback) -
         line.value = "zzz"
         await shown(pilot, app)
         assert "none of 8 recordings has these words" in screen_text(app)
-        await pilot.press("escape")
-        await shown(pilot, app)
+        await pressed(pilot, app, "escape")
         assert "torn.h5" in screen_text(app)
 
 
@@ -96,8 +80,7 @@ async def test_a_recording_is_opened_and_shows_its_result(
     with growing(path) as writer:
         writer.close()
     store_results(path, made_snapshot(closed=True))
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW, notifications=True) as pilot:
+    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
         await pilot.press("4")
         await settled(pilot, app)
         assert "old.h5" in screen_text(app)
@@ -113,12 +96,10 @@ async def test_it_is_estimated_again_with_the_settings_that_were_typed(
 ) -> None:
     with growing(tmp_path / "old.h5") as writer:
         writer.close()
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("4")
         await settled(pilot, app)
-        await pilot.press("e", *"all", "tab", *"abc")
-        await shown(pilot, app)
+        await pressed(pilot, app, "e", *"all", "tab", *"abc")
         assert "abc: expected" in screen_text(app)
         await pilot.press("enter")  # not taken
         assert told.told == []
@@ -131,8 +112,7 @@ async def test_deleting_is_asked_and_only_y_does_it(told: ProgressCallback, tmp_
     path = tmp_path / "old.h5"
     with growing(path) as writer:
         writer.close()
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await pilot.press("4")
         await settled(pilot, app)
         await pilot.press("p")
@@ -157,7 +137,6 @@ async def test_a_recording_that_grows_can_be_opened_but_not_deleted(
             await pilot.press("4")
             await settled(pilot, app)
             assert "● recording" in screen_text(app)
-            await pilot.press("delete", "y", "e")
-            await shown(pilot, app)
+            await pressed(pilot, app, "delete", "y", "e")
             assert (tmp_path / "new.h5").exists()
             assert len(app.screen_stack) == 1

@@ -15,7 +15,16 @@ from textual.widgets import Input
 from daq.bench.model import Limit
 from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown
+from tests.tui.application.test_app import (
+    NARROW,
+    WIDE,
+    ended,
+    opened,
+    pressed,
+    running,
+    settled,
+    shown,
+)
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
 from tui.application.app import HuddleApp
 from tui.application.forms.estimate import as_changes
@@ -56,25 +65,21 @@ async def at_result(pilot: Pilot[None], app: HuddleApp) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await at_result(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-result-limits")
         await shown(pilot, app, ReferenceReady(earlier(told.folder)))
         await assert_looks_as_before(pilot, f"{name}-result-compared")
-        await pilot.press("2")
-        await shown(pilot, app)
+        await pressed(pilot, app, "2")
         await assert_looks_as_before(pilot, f"{name}-test-compared")
 
 
 async def test_what_cannot_be_compared_says_why_and_c_ends_it(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await at_result(pilot, app)
         await shown(pilot, app, ReferenceReady(earlier(told.folder, unit="m/s")))
         assert "cannot be compared: units differ: m/s² and m/s" in screen_text(app)
-        await pilot.press("c")
-        await shown(pilot, app)
+        await pressed(pilot, app, "c")
         assert "compared" not in screen_text(app)
         await pilot.press("c")
         assert app.current_mode == RECORDINGS  # to choose one
@@ -85,12 +90,10 @@ async def test_another_estimate_starts_from_the_settings_shown(told: ProgressCal
     async with app.run_test(size=NARROW) as pilot:
         await app.workers.wait_for_complete()
         await at_result(pilot, app)
-        await pilot.press("e")
-        await shown(pilot, app)
+        await pressed(pilot, app, "e")
         assert "three-sensor,three-channel" in screen_text(app)
         await pilot.press("tab", *"4s", "enter")
-        await app.workers.wait_for_complete()
-        await shown(pilot, app)
+        await settled(pilot, app)
     wanted = as_changes(SETTINGS) | {"segment": 4.0}
     assert told.told == [f"about run.h5 {wanted}"]
 
@@ -136,8 +139,7 @@ async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
     line = "A S4254475: +0.7 ± 0.2 dB since 25 October, 3 tests (1–20 Hz)"
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await shown(pilot, app, *ended())
         app.state = replace(app.state, path=told.path)
         await shown(pilot, app, SensorsNoted(told.path.with_name("other.h5"), ("of another",)))
@@ -151,8 +153,7 @@ async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
 async def test_a_comparison_says_where_a_name_is_another_sensor_now(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         status, snapshot = ended()
         assert isinstance(status, StatusUpdated)
         sensors = tuple(replace(s, serial_number=f"S{s.name}") for s in status.now.sensors)
@@ -174,8 +175,7 @@ async def test_i_asks_who_authorises_and_issues_or_makes_a_specimen(
         await app.workers.wait_for_complete()
         await at_result(pilot, app)
         assert "i Issue" in screen_text(app)
-        await pilot.press("i")
-        await shown(pilot, app)
+        await pressed(pilot, app, "i")
         assert "certificate of run.h5" in screen_text(app)
         assert "Empty: a specimen, watermarked" in screen_text(app)
         await pilot.press("enter")
@@ -185,13 +185,11 @@ async def test_i_asks_who_authorises_and_issues_or_makes_a_specimen(
             ("i", "escape"),
             ("i", *"Nobody", "enter"),
         ):
-            await pilot.press(*keys[:1])
-            await shown(pilot, app)
+            await pressed(pilot, app, *keys[:1])
             kept = app.screen.query_one("#by", Input).value
             assert kept == ("Ada" if "escape" in keys or "N" in keys else "")
             await pilot.press(*keys[1:])
-            await app.workers.wait_for_complete()
-            await shown(pilot, app)
+            await settled(pilot, app)
         assert "sensors were simulated" in screen_text(app)
         assert "Make a specimen instead?" in screen_text(app)
         await pilot.press("y")

@@ -12,7 +12,7 @@ import pytest
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.types import FloatArray
 from tests.tui.application.screen_text import screen_text
-from tests.tui.application.test_app import NARROW, running, shown
+from tests.tui.application.test_app import NARROW, opened, running, shown
 from tests.tui.example_snapshot import ProgressCallback
 from tui.application.app import HuddleApp
 from tui.application.test_view.plotted import STYLES
@@ -71,8 +71,10 @@ def test_colour_blind_eyes_tell_states_and_curves_apart(eyes: str) -> None:
 
 
 async def test_themes_change_colours_and_nothing_else(tmp_path: Path) -> None:
-    app = HuddleApp(ProgressCallback(tmp_path / "run.h5"))
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(ProgressCallback(tmp_path / "run.h5")), size=NARROW) as (
+        app,
+        pilot,
+    ):
         await shown(pilot, app, *running())
         assert set(app.available_themes) == set(THEMES)
         said, drawn = set(), {}

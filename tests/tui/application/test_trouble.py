@@ -14,7 +14,17 @@ from daq.errors import HuddleError
 from daq.results.result import Result
 from estimator.wording import clock_time
 from tests.tui.application.screen_text import resized, screen_text
-from tests.tui.application.test_app import NARROW, WIDE, ended, running, shown, view
+from tests.tui.application.test_app import (
+    NARROW,
+    WIDE,
+    ended,
+    opened,
+    pressed,
+    running,
+    settled,
+    shown,
+    view,
+)
 from tests.tui.example_snapshot import (
     SETTINGS,
     STRANGER,
@@ -51,13 +61,11 @@ async def test_starting_over_a_result_is_asked_first(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
     path = tmp_path / "old.h5"  # which is not there: nothing else comes
-    app = HuddleApp(told, path=path)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told, path=path), size=NARROW) as (app, pilot):
         await app.workers.wait_for_complete()
         await shown(pilot, app, *running())
         await shown(pilot, app, *ended())
-        await pilot.press("s")
-        await shown(pilot, app)
+        await pressed(pilot, app, "s")
         assert "start a test; old.h5 is kept" in screen_text(app)
         await pilot.press("s", "y", "tab", "x", "escape")  # none of them starts
         assert told.told == []
@@ -70,12 +78,10 @@ async def test_starting_over_a_result_is_asked_first(
 async def test_why_no_recording_started_stays_on_the_screen(
     tmp_path: Path, size: tuple[int, int]
 ) -> None:
-    app = HuddleApp(Refusing(tmp_path / "run.h5"))
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(Refusing(tmp_path / "run.h5")), size=size) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.press("s", "enter")
-        await app.workers.wait_for_complete()
-        await shown(pilot, app)
+        await settled(pilot, app)
         await pilot.press("escape", "2", "d", "escape", "1")
         text = screen_text(app)
         assert "sensor A at /dev/ttyUSB0: no answer" in text
@@ -88,18 +94,15 @@ async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_con
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
     told.wrong = ("B.X reads 0.102 of A and C (g in place of m/s²)", "C.Z is reversed")
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         for answer in ("escape", "y"):
             await pilot.press("s", "enter")
-            await app.workers.wait_for_complete()
-            await shown(pilot, app)
+            await settled(pilot, app)
             text = screen_text(app)
             assert all(f"✗ {line}" in text for line in told.wrong)
             assert told.told == []
             await pilot.press(answer)
-            await app.workers.wait_for_complete()
-            await shown(pilot, app)
+            await settled(pilot, app)
             if answer == "escape":
                 await pilot.press("1")
                 assert "▲ C.Z is reversed" in screen_text(app)  # and what is wrong stays there
@@ -107,8 +110,7 @@ async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_con
 
 
 async def test_a_recorder_that_is_gone_leaves_no_sensor_live(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         assert "● live" in screen_text(app)
         assert "Waits for C." in screen_text(app)
@@ -123,8 +125,7 @@ async def test_states_and_progress_are_there_before_the_first_estimate(
     told: ProgressCallback,
 ) -> None:
     """Of a recording of hours the first estimate takes a while."""
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, StatusUpdated(made_now(elapsed=7200.0)), Progress(300, 1000))
         text = screen_text(app)
         assert "● live" in text
@@ -142,15 +143,12 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
     three_channel = snapshot.results["three-channel"]
     sure = replace(three_channel, cov=three_channel.cov * 1e-3)
     snapshot = replace(snapshot, results={**snapshot.results, "three-channel": sure})
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await shown(
             pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
         )
         for _ in range(3):
-            await pilot.press("e")
-            await shown(pilot, app)
-            text = screen_text(app)
+            text = await pressed(pilot, app, "e")
             assert "c.o.v. 46 %" in text
             assert "target reached" not in text
         assert view(app).choice.methods != ("three-sensor",)
@@ -165,8 +163,7 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
     live = tuple(replace(s, overdue_for=0.0, state=made_now().sensors[0].state)
                  for s in made_now().sensors)  # fmt: skip
     now = replace(made_now(), sensors=live)
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, SETTINGS)))
         text = screen_text(app)
         assert "✗ A records none of the motion that B and C share: check its input" in text
@@ -182,8 +179,7 @@ async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
     limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(8e-12, 8e-12))
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     told.bench = parse(text).model_copy(update={"limits": (limit,)})
-    app = HuddleApp(told)
-    async with app.run_test(size=WIDE) as pilot:
+    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
         snapshot = made_snapshot(n_effective=60.0)
         await shown(
             pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from daq.bench.model import Limit
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, ended, running, shown
+from tests.tui.application.test_app import NARROW, ended, opened, pressed, running, settled, shown
 from tests.tui.application.test_bench_view import SOUND, Reading
-from tests.tui.application.test_recordings import entries, settled
+from tests.tui.application.test_recordings import entries
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
@@ -18,18 +16,11 @@ from tui.application.messages import CatalogueRead, SnapshotReady
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
 
 
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench())
-
-
 async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         footers, helps = set(), set()
         for number, name in enumerate(VIEWS, start=1):
-            await pilot.press(str(number))
-            await shown(pilot, app)
+            await pressed(pilot, app, str(number))
             assert app.current_mode == name
             keys = screen_text(app).splitlines()[-1]
             footers.add(keys)
@@ -47,8 +38,7 @@ async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: Progre
 async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW, notifications=True) as pilot:
+    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
         await shown(pilot, app, *running())
         await pilot.press("question_mark")
         await shown(pilot, app, *ended())
@@ -63,14 +53,12 @@ async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
 
 
 async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         await pilot.press("3")
         await shown(pilot, app, *running(n_effective=500))
         assert "No result yet" in screen_text(app)
-        await pilot.press("2")
-        await shown(pilot, app)
+        await pressed(pilot, app, "2")
         assert "530 segments" in screen_text(app)
 
 
@@ -78,8 +66,7 @@ async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCa
 async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await shown(pilot, app, *running())
         commands = {each.title: each for each in app.get_system_commands(app.screen)}
         tasks = {"Stop the test", "Show how the clocks drift", "Add a sensor"}
@@ -98,8 +85,7 @@ async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
 async def test_the_top_line_keeps_what_matters_when_it_is_narrow(
     told: ProgressCallback, width: int, named: int
 ) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=(width, 24)) as pilot:
+    async with opened(HuddleApp(told), size=(width, 24)) as (app, pilot):
         await shown(pilot, app, *running())
         line = screen_text(app).splitlines()[0]
         assert "● recording  1:40" in line
@@ -107,8 +93,7 @@ async def test_the_top_line_keeps_what_matters_when_it_is_narrow(
 
 
 async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback) -> None:
-    app = HuddleApp(told)
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         first, second = running(), running(n_effective=500)
         await shown(pilot, app, *first)
         assert app.state.result is not None
@@ -125,8 +110,7 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
     told.sensors = reading = Reading(SOUND)
     mask = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
     told.bench = demo_bench().model_copy(update={"limits": (mask,)})
-    app = HuddleApp(told)
-    async with app.run_test(size=size) as pilot:
+    async with opened(HuddleApp(told), size=size) as (app, pilot):
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-idle")
         await pilot.press("p")
