@@ -8,7 +8,6 @@ import ast
 import inspect
 import json
 import re
-import textwrap
 from collections.abc import Iterator
 from dataclasses import fields
 from enum import StrEnum
@@ -27,6 +26,7 @@ from daq.bench.model import TABLES, Bench
 from daq.protocols.block import EventKind
 from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import MARKS, Fact, Finding
+from docs.schema import ATTRIBUTE, explanations, plain_text
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.decision.verdict import Obstacle
 from estimator.records import json_key
@@ -42,7 +42,6 @@ _WRITTEN = {"[[schedule.runs]]": "[[schedule]]"}
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 _DURATION = "duration, such as `90s` or `2h`"
 _BLANK = "\n\n"
-_ATTRIBUTE = re.compile(r"^(\w[\w, ]*) : .*((?:\n +.*)*)", re.MULTILINE)
 """Names and meaning of attributes of one entry of a numpydoc section."""
 ROOT = Path(__file__).resolve().parents[1]
 VALUES: dict[str, type[StrEnum]] = {
@@ -111,7 +110,7 @@ def values(name: str) -> str:
     """Return a table of the values of one of `VALUES`, by their docstrings."""
     kind = VALUES[name]
     said = explanations(kind)
-    rows = [f"| `{each.value}` | {_plain(said[each.name])} |" for each in kind]
+    rows = [f"| `{each.value}` | {plain_text(said[each.name])} |" for each in kind]
     return "\n".join(["| value | meaning |", "|---|---|", *rows])
 
 
@@ -121,7 +120,9 @@ def packages() -> str:
     for room in ("daq", "estimator", "sim_devices", "tui"):
         for path in sorted((ROOT / room).glob("*/__init__.py")):
             about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-            rows.append(f"| `{room}.{path.parent.name}` | {_plain(about.partition(_BLANK)[0])} |")
+            rows.append(
+                f"| `{room}.{path.parent.name}` | {plain_text(about.partition(_BLANK)[0])} |"
+            )
     return "\n".join(rows)
 
 
@@ -141,17 +142,17 @@ def _kinds(base: type[Any], named: dict[str, type[Any]]) -> str:
     for name, kind in sorted(named.items()):
         in_json = {each.name: json_key(each) for each in fields(kind)}
         about, _, rest = (inspect.getdoc(kind) or "").partition(_BLANK)
-        said = dict(_ATTRIBUTE.findall(rest))
+        said = {names: text for names, _, text in ATTRIBUTE.findall(rest)}
         entries = [keys.split(", ") for keys in said]
         written = set(chain.from_iterable(entries))
         entries += [[each.name] for each in fields(kind) if each.name not in written]
         numbers = "; ".join(
             f"{', '.join(f'`{in_json[key]}`' for key in keys)}"
-            f" {_plain(said.get(', '.join(keys), ''))}".rstrip(". ")
+            f" {plain_text(said.get(', '.join(keys), ''))}".rstrip(". ")
             for keys in entries
             if keys[0] not in common
         )
-        rows.append(re.sub("NaN|None", "null", f"| `{name}` | {_plain(about)} | {numbers} |"))
+        rows.append(re.sub("NaN|None", "null", f"| `{name}` | {plain_text(about)} | {numbers} |"))
     return "\n".join(rows)
 
 
@@ -160,7 +161,7 @@ def _keys(schema: dict[str, Any], before: str) -> Iterator[tuple[str, str]]:
     for key, part in schema.get("properties", {}).items():
         links = re.findall(r'"#/\$defs/(\w+)"', json.dumps(part))
         link = "".join(f" See `{each}`." for each in dict.fromkeys(links))
-        yield before + key, _plain(part.get("description", "") + link).replace("|", "\\|")
+        yield before + key, plain_text(part.get("description", "") + link).replace("|", "\\|")
         for option in (part, *part.get("anyOf", ()), *part.get("oneOf", ())):
             for inner in (option, option.get("items", {})):
                 yield from _keys(inner, f"{before}{key}.")
@@ -198,21 +199,7 @@ def _section(path: str, model: type[BaseModel]) -> str:
             cells = _kind(field), _default(key, field, path), _text(key, field, model, path)
             rows.append(f"| `{key}` | {' | '.join(cells)} |")
     table = "\n".join(["| key | value | default | |", "|---|---|---|---|", *rows]) if rows else ""
-    return f"## {heading}\n\n{_plain(about.partition(_BLANK)[0])}\n\n{table}\n"
-
-
-def explanations(model: type[Any]) -> dict[str, str]:
-    """Return what the docstrings below the keys of a table, or the values of a kind, say."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
-    assert isinstance(tree, ast.ClassDef)  # noqa: S101 - for the types
-    found, key = {}, ""
-    for node in tree.body:
-        target = getattr(node, "target", None) or getattr(node, "targets", [None])[0]
-        if isinstance(target, ast.Name):
-            key = target.id
-        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and key:
-            found[key] = inspect.cleandoc(str(node.value.value))
-    return found
+    return f"## {heading}\n\n{plain_text(about.partition(_BLANK)[0])}\n\n{table}\n"
 
 
 def _text(key: str, field: Any, model: type[BaseModel], path: str) -> str:
@@ -220,11 +207,7 @@ def _text(key: str, field: Any, model: type[BaseModel], path: str) -> str:
         found = OPTIONS[table_keys()[key]].help
     else:
         found = explanations(model).get(key) or field.description or ""
-    return _plain(found).replace("|", "\\|")
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.replace("``", "`").split())
+    return plain_text(found).replace("|", "\\|")
 
 
 def _default(key: str, field: Any, path: str) -> str:

@@ -51,7 +51,15 @@ _EPOCH = date(1970, 1, 1).toordinal()
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A value with its 95 % interval; NaN where it is not decided."""
+    """A value with its 95 % interval.
+
+    Attributes
+    ----------
+    value : float
+        NaN where it is not decided.
+    low, high : float
+        The interval.
+    """
 
     value: float = math.nan
     low: float = math.nan

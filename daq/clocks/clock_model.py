@@ -167,7 +167,7 @@ class ClockSetting:
     """
 
     utc_ns: int
-    step: float = field(metadata={"key": "step_s"})
+    step: float = field(metadata={"key": "step_s", "type": "number"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +178,7 @@ class ClockState:
     ----------
     sensor : str
     source : ClockSource
+        How the times are known.
     offset : float
         Time of the first sample in seconds from the recording's origin.
     ppm, ppm_std : float

@@ -122,9 +122,11 @@ class FrequencyDiagnosis:
     Attributes
     ----------
     coherence, condition : float64, shape (n_freqs, n_pairs)
-        As in `estimator.checks.diagnose.Diagnostics`, and so are `dimension` and `snr`.
+        Of each pair, as in `estimator.checks.diagnose.Diagnostics`.
     dimension : float64, shape (n_freqs,)
+        Effective dimension of the motion.
     snr : float64, shape (n_freqs, n_channels)
+        PSD of the motion over PSD of the noise.
     statistic, degrees, p_value : float64, shape (n_freqs,)
         Of the model test: `estimator.likelihood.goodness_of_fit.ModelTest`.
     """

@@ -162,7 +162,7 @@ class Uncounted:
 
     utc_ns: int
     within: float = field(metadata={"key": "within_s"})
-    n_samples: int = field(metadata={"key": "samples"})
+    n_samples: int = field(metadata={"key": "samples", "minimum": None})
 
     def is_that(self, other: Uncounted) -> bool:
         """Whether both may be one, found twice."""

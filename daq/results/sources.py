@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from daq.recording.reader import SensorRecord
 
 _SECOND_NS = 1_000_000_000
-State: TypeAlias = Literal["closed", "growing", "continued", "left open"]
+State: TypeAlias = Literal["closed", "growing", "continued", "left-open"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Source:
         UTC.
     last : datetime
         UTC of the last block received.
-    state : {"closed", "growing", "continued", "left open"}
+    state : {"closed", "growing", "continued", "left-open"}
         Continued in the file that follows, because the disk refused this one. Left open by a
         recorder that was killed, and not repaired since.
     recording : Recording
@@ -163,7 +163,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
     logged_events.sort(key=lambda each: each.utc_ns)
     state: State = "closed"
     if not recording.closed:
-        state = "continued" if continued else "left open"
+        state = "continued" if continued else "left-open"
         if is_being_written(path):
             state = "growing"
     return Source(

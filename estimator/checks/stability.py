@@ -112,8 +112,9 @@ class Scatter:
     Attributes
     ----------
     n_parts : int
+        Number of parts.
     deviation : float64, shape (n_bands, n_channels)
-        NaN for bands that are not tested.
+        Standard deviation over the noise; NaN for bands that are not tested.
     expected : float64, shape (n_bands, n_channels)
         Expected deviation for steady noise.
     statistic : float64, shape (n_bands, n_channels)

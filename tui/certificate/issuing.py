@@ -163,7 +163,7 @@ def examine(
                     "; --specimen makes a specimen",
                 )
             )
-        if source.state in {"growing", "left open"}:
+        if source.state in {"growing", "left-open"}:
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
             objections.append(Objection(f"{source.path}: not closed; {wanted}"))
     if not any(source.state == "growing" for source in found):

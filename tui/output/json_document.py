@@ -1,6 +1,7 @@
 """A finished estimate, or a calibration, as the JSON that ``--json`` writes.
 
-docs/json.md describes it for people, ``tui/resources/result-2.schema.json`` for programs.
+docs/json.md describes it for people, ``tui/resources/result-2.schema.json`` for programs, and
+`tui.output.documents` declares its keys.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
@@ -22,17 +23,14 @@ from estimator.records import json_key
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
-from tui.output.curves import CURVES
 from tui.output.json_values import json_text, plain
 from tui.output.noise_parameters import noise_parameters_document
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
     from daq.estimation.snapshot_diagnostics import (
-        Diagnosis,
         Synchronisation,
     )
     from daq.results.calibration import Calibration
@@ -40,13 +38,24 @@ if TYPE_CHECKING:
     from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
     from estimator.checks.stability import Stability
+    from tui.output.documents import (
+        BandMeanDocument,
+        DiagnosticsDocument,
+        EstimateDocument,
+        FactDocument,
+        FindingDocument,
+        RecordingDocument,
+        StabilityDocument,
+        SynchronisationDocument,
+        VerdictDocument,
+    )
 
 
 SCHEMA_VERSION = 2
 """Rises when a key is removed or changes its meaning; new keys do not change it."""
 
 
-def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
+def result_document(snapshot: Snapshot, method: str) -> EstimateDocument:
     """Return one method's result as the JSON that ``--json`` writes."""
     noise = snapshot.results[method]
     data = snapshot.data_psd
@@ -61,7 +70,10 @@ def result_document(snapshot: Snapshot, method: str) -> dict[str, Any]:
                 "channel": label.channel,
                 "unit": label.unit,
                 "data_psd": data[:, column],
-                **{each.key: getattr(noise, each.field)[:, column] for each in CURVES},
+                "noise_psd": noise.noise_psd[:, column],
+                "noise_psd_low": noise.low[:, column],
+                "noise_psd_high": noise.high[:, column],
+                "cov": noise.cov[:, column],
                 "flags": noise.flags[:, column],
             }
             for column, label in enumerate(snapshot.channels)
@@ -133,7 +145,7 @@ def _instant(utc_ns: int) -> str:
     return f"{datetime.fromtimestamp(whole, tz=UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
-def _recording(source: Source) -> dict[str, Any]:
+def _recording(source: Source) -> RecordingDocument:
     bench = source.recording.outline
     return {
         "file": source.path.name,
@@ -141,7 +153,7 @@ def _recording(source: Source) -> dict[str, Any]:
         "sha256": source.sha256 or None,
         "signed_by": source.signed_by or None,
         "bytes": source.n_bytes,
-        "state": source.state.replace(" ", "-"),
+        "state": source.state,
         "software": source.software,
         "operator": source.operator or None,
         "location": source.location or None,
@@ -202,13 +214,13 @@ def _settings(result: Result) -> dict[str, Any]:
     }
 
 
-def _band_means(result: Result) -> list[dict[str, Any]]:
+def _band_means(result: Result) -> list[BandMeanDocument]:
     """Return the mean noise of every channel in the band of the tables, by every method."""
     snapshot = result.snapshot
     if not snapshot.results:
         return []
     band, data = result.band, result.data.tolist()
-    documents = []
+    documents: list[BandMeanDocument] = []
     for method in snapshot.results:
         found, means = result.levels(method, band), result.means(method)
         for column, label in enumerate(snapshot.channels):
@@ -239,7 +251,7 @@ def _band_means(result: Result) -> list[dict[str, Any]]:
     return documents
 
 
-def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
+def verdict_document(found: TestVerdict | None) -> VerdictDocument:
     """Return the verdict on the limits of the bench file; null where it has none."""
     if found is None:
         return {
@@ -293,7 +305,7 @@ def verdict_document(found: TestVerdict | None) -> dict[str, Any]:
     }
 
 
-def facts_document(facts: Sequence[Fact]) -> list[dict[str, Any]]:
+def facts_document(facts: Sequence[Fact]) -> list[FactDocument]:
     """Return what is known of a test beyond its numbers, the worst first."""
     return [
         {
@@ -313,7 +325,11 @@ def facts_document(facts: Sequence[Fact]) -> list[dict[str, Any]]:
     ]
 
 
-_LEVELS = {Rank.INVALIDATES: "problem", Rank.DELAYS: "warning", Rank.TO_KNOW: "note"}
+_LEVELS: Mapping[Rank, Literal["problem", "warning", "note"]] = {
+    Rank.INVALIDATES: "problem",
+    Rank.DELAYS: "warning",
+    Rank.TO_KNOW: "note",
+}
 """Ranks of findings in JSON."""
 
 
@@ -329,7 +345,7 @@ def _beyond(base: type[Fact | Advice], found: Fact | Advice) -> dict[str, Any]:
     return {key: value for key, value in plain(found).items() if key not in common}
 
 
-def _finding(advice: Advice) -> dict[str, Any]:
+def _finding(advice: Advice) -> FindingDocument:
     return {
         "kind": advice.name,
         "level": _LEVELS[advice.rank],
@@ -387,10 +403,10 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
     }
 
 
-def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
+def diagnostics_document(snapshot: Snapshot) -> DiagnosticsDocument:
     """Return what the samples show of the test (docs/json.md)."""
     found = snapshot.diagnostics
-    document: dict[str, Any] = {
+    document: DiagnosticsDocument = {
         "start_utc_ns": snapshot.start_utc_ns,
         "elapsed_s": snapshot.elapsed,
         "is_closed": snapshot.closed,
@@ -398,10 +414,13 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
         "excluded_by_reason": snapshot.left_out,
         "bridged": snapshot.bridged,
         "octaves": snapshot.octaves,
-        "flags": {flag.name: flag.value for flag in Flag},
+        "flags": {str(flag.name): flag.value for flag in Flag},
         "refused": snapshot.refused,
         "sensors": snapshot.sensors,
-        "clocks": [_clock(each) for each in snapshot.clocks],
+        "clocks": [
+            plain(each) | {"shared_clock": each.shared_clock or None, "restarts": each.n_epochs - 1}
+            for each in snapshot.clocks
+        ],
         "events": uncounted_events(snapshot.clocks),
         "drift_s": snapshot.drift,
         "synchronisation": _synchronisation(found.synchronisation),
@@ -412,25 +431,30 @@ def diagnostics_document(snapshot: Snapshot) -> dict[str, Any]:
     if found.dimensions:
         document["dimensions"] = found.dimensions
     if found.diagnosis is not None:
-        document |= _diagnosis(found.diagnosis, snapshot)
-    for key, by_column in (
-        ("clipped_share", found.counts.clipped),
-        ("repeated_share", found.counts.repeated),
-        ("wraps_at_bits", {n: one.bits for n, one in found.counts.wrapped.items()}),
-        ("stood_still_s", found.stood_still),
-    ):
-        if by_column:
-            document[key] = {snapshot.channels[n].name: value for n, value in by_column.items()}
+        sensors, stability = snapshot.sensor_names, found.diagnosis.stability
+        document |= {
+            "tested_dimensions": found.diagnosis.n_factors,
+            "bands": found.diagnosis.bands,
+            "responses": found.diagnosis.responses,
+            "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
+            "stability": None if stability is None else _stability(stability),
+            "pairs": [(sensors[one], sensors[two]) for one, two in found.diagnosis.pairs],
+            "per_frequency": found.diagnosis.per_frequency,
+        }
+    names, counts = [label.name for label in snapshot.channels], found.counts
+    if counts.clipped:
+        document["clipped_share"] = {names[n]: share for n, share in counts.clipped.items()}
+    if counts.repeated:
+        document["repeated_share"] = {names[n]: share for n, share in counts.repeated.items()}
+    if counts.wrapped:
+        document["wraps_at_bits"] = {names[n]: one.bits for n, one in counts.wrapped.items()}
+    if found.stood_still:
+        document["stood_still_s"] = {names[n]: s for n, s in found.stood_still.items()}
     return document
 
 
-def _clock(each: ClockState) -> dict[str, Any]:
-    declared: dict[str, Any] = plain(each)
-    return declared | {"shared_clock": each.shared_clock or None, "restarts": each.n_epochs - 1}
-
-
-def _synchronisation(found: Synchronisation) -> dict[str, Any]:
-    document: dict[str, Any] = {
+def _synchronisation(found: Synchronisation) -> SynchronisationDocument:
+    document: SynchronisationDocument = {
         "residual_s": found.residual,
         "reference": found.reference or None,
     }
@@ -439,20 +463,7 @@ def _synchronisation(found: Synchronisation) -> dict[str, Any]:
     return document
 
 
-def _diagnosis(found: Diagnosis, snapshot: Snapshot) -> dict[str, Any]:
-    sensors = snapshot.sensor_names
-    return {
-        "tested_dimensions": found.n_factors,
-        "bands": found.bands,
-        "responses": found.responses,
-        "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
-        "stability": None if found.stability is None else _stability(found.stability),
-        "pairs": [(sensors[one], sensors[two]) for one, two in found.pairs],
-        "per_frequency": found.per_frequency,
-    }
-
-
-def _stability(found: Stability) -> dict[str, Any]:
+def _stability(found: Stability) -> StabilityDocument:
     return {
         "low_hz": found.low,
         "high_hz": found.high,

@@ -82,7 +82,7 @@ _STATES = {
     "closed": "closed",
     "growing": "still being written",
     "continued": "refused by the disk and continued in another file",
-    "left open": "not closed: its recorder was killed",
+    "left-open": "not closed: its recorder was killed",
 }
 
 
@@ -112,7 +112,7 @@ def report_of(
     states = {source.state for source in found}
     if "growing" in states or (not snapshot.closed and states == {"closed"}):
         sentence = Paragraph(f"Still running, preliminary. {sentence.text}", "doubtful")
-    elif "left open" in states:
+    elif "left-open" in states:
         text = (
             f"Of a recording whose recorder was killed (huddle repair closes it). {sentence.text}"
         )

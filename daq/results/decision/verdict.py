@@ -17,24 +17,33 @@ from estimator.records import Hertz, dataclass
 
 @dataclass(frozen=True, slots=True)
 class LimitResult:
-    """One channel beside one limit, in the band where it does worst; PSD in unit²/Hz.
+    """One channel beside one limit, in the third-octave band where it does worst; PSD in unit²/Hz.
 
     NaN throughout where there is no estimate in any band of the limit.
 
     Attributes
     ----------
-    limit, sensor, channel, method : str
+    limit, sensor, channel : str
+        Name.
+    method : str
+        Method that judges.
     frequency : float
         Centre of the band, Hz.
-    noise_psd, low, high : float
-        Mean over the band, and its interval, which holds for all channels and bands together.
+    noise_psd : float
+        Mean noise in the band, one-sided.
+    low, high : float
+        Its interval, which holds for all channels and bands together.
     limit_psd : float
+        The limit at that frequency.
     verdict : Verdict
-    covers, judged : (float, float)
-        From and to which frequency the limit goes, and to which of them it was judged: as far as
-        the spectrum goes, and something is known. Hz; NaN where none was.
+        On this limit.
+    covers : (float, float)
+        From and to which frequency the limit goes, Hz.
+    judged : (float, float)
+        From and to which of them it was judged: as far as the spectrum goes, and something is
+        known. Hz; NaN where none was.
     obstacle : Obstacle or None
-        None where the limit is decided.
+        What keeps the limit from a decision; None where it is decided.
     """
 
     limit: str
@@ -47,7 +56,7 @@ class LimitResult:
     high: float = field(metadata={"key": "noise_psd_high"})
     limit_psd: float
     verdict: Verdict
-    covers: tuple[float, float] = field(metadata={"key": "limit_hz"})
+    covers: tuple[float, float] = field(metadata={"key": "limit_hz", "items": {"type": "number"}})
     judged: tuple[Hertz, Hertz]
     obstacle: Obstacle | None = None
 

@@ -19,6 +19,7 @@ import huddle
 from daq.bench.estimate_settings import table_keys
 from daq.recording.reader import Recording
 from daq.recording.sensor_record import _NEWEST_ROWS
+from docs.schema import texts
 from tests.daq.clocks.recordings import write_polled
 from tests.full_disk import files_limited_to
 from tests.tui.night_recording import HOSTILE, record
@@ -92,6 +93,12 @@ def test_the_schema_is_one_itself() -> None:
         "const": SCHEMA_VERSION,
         "description": SCHEMA["properties"]["schema_version"]["description"],
     }
+
+
+def test_the_published_schemas_are_those_of_the_declared_types() -> None:
+    """``python -m docs.schema`` writes them again."""
+    for name, text in texts().items():
+        assert (resources.files("tui.resources") / name).read_text("utf-8") == text, name
 
 
 def test_the_schema_refuses_what_is_wrong(written: Written) -> None:
