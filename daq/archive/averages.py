@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import canonical
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.estimation.contributions import with_contributions
 from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
 from daq.estimation.equalisation import Equalisation
@@ -175,7 +176,7 @@ class Estimator:
             diagnostics=diagnostics,
             across_axes=axes,
             rounding=ROUNDING if average.is_rounded else 0.0,
-            simulated=average.is_simulated,
+            caveats=average.caveats,
             shortened=average.shortened,
         )
         return with_contributions(snapshot)
@@ -197,8 +198,7 @@ class Average:
         self.n_segments = 0
         self.is_rounded = False
         """Whether matrices were kept in single precision."""
-        self.is_simulated = False
-        """Whether a sensor of a recording was simulated."""
+        self.caveats = NO_CAVEATS
         self.start_utc_ns = 0
         self.usable = np.inf
         self.elapsed = 0.0
@@ -227,7 +227,7 @@ class Average:
         self._counts[described.origin.run_id] += n_segments
         self.usable = min(self.usable, described.usable)
         self.is_rounded |= described.rounded
-        self.is_simulated |= described.simulated
+        self.caveats = Caveats.joined([self.caveats, described.caveats])
         for sensor, residual in described.residual.items():
             square = self._squares.get(sensor, 0.0)
             self._squares[sensor] = square + n_segments * residual**2

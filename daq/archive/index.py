@@ -20,6 +20,7 @@ import numpy as np
 from daq.archive.rollup import month_of
 from daq.archive.spectra_file import Described, Origin, SpectraFile
 from daq.bench.channel import Channel
+from daq.caveats import Caveat, Caveats
 from daq.recording.file_format import channel_attributes, channels_of, texts
 from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
@@ -33,7 +34,7 @@ CREATE TABLE IF NOT EXISTS recordings
 CREATE TABLE IF NOT EXISTS channels (key TEXT PRIMARY KEY, document TEXT);
 """
 _BUSY_SECONDS = 10.0
-PLAIN = ("usable", "elapsed", "residual", "rounded", "simulated")
+PLAIN = ("usable", "elapsed", "residual", "rounded")
 """Fields of `Described` that a document has as they are."""
 
 
@@ -133,6 +134,7 @@ class Index:
                 lacking={int(k): v for k, v in found.pop("lacking").items()},
                 shortened={k: (v[0], v[1]) for k, v in found.pop("shortened").items()},
                 not_understood=tuple(found.pop("not_understood")),
+                caveats=Caveats(map(Caveat, found.pop("caveats"))),
                 **{name: found.pop(name) for name in PLAIN},
             )
             return IndexEntry(path, described, **found)

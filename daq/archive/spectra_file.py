@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
@@ -106,8 +107,8 @@ class Described:
         As in `daq.estimation.snapshot.Snapshot`.
     rounded : bool
         Whether estimates are made of matrices that were kept in single precision.
-    simulated : bool
-        Whether a sensor was simulated; earlier versions did not keep it.
+    caveats : Caveats
+        Earlier versions did not keep them.
     """
 
     origin: Origin
@@ -122,7 +123,7 @@ class Described:
     lacking: Mapping[int, int] = field(default_factory=dict)
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rounded: bool = False
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,7 +275,7 @@ class SpectraWriter:
                 "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
                 **{name: json.dumps(each) for name, each in asdict(described.counts).items()},
                 "stood_still": json.dumps(dict(described.stood_still)),
-                "simulated": int(described.simulated),
+                **{key: int(holds) for key, holds in described.caveats.keys.items()},
                 "lacking": json.dumps(dict(described.lacking)),
                 "shortened": json.dumps(dict(described.shortened)),
                 "daily": int(self._daily),
@@ -349,7 +350,7 @@ class SpectraFile:
                 {k.name: _table(attributes, k.name, optional=True) for k in fields(CountLimits)}
             ),
             stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
-            simulated=bool(attributes.get("simulated", 0)),
+            caveats=Caveats.of(attributes),
             lacking={
                 int(k): int(v) for k, v in _table(attributes, "lacking", optional=True).items()
             },

@@ -215,7 +215,7 @@ def _written(
             ),
             counts=limits_by_column([(each.recording, each.unused())], channels),
             stood_still=still_for_a_while([each], settings),
-            simulated=recording.simulated,
+            caveats=recording.caveats,
             lacking=each.sets.lacking(each.n_channels),
             shortened=each.aligned.shortened,
         )

@@ -85,9 +85,7 @@ def without_sensor(text: str, name: str) -> str:
         if str(table.get("name")) == name:
             del sensors[number]
             break
-    simulated = document.get("simulation", {}).get("sensors", {})
-    if name in simulated:
-        del simulated[name]
+    document.get("simulation", {}).get("sensors", {}).pop(name, None)
     return tomlkit.dumps(document)
 
 

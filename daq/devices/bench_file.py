@@ -7,9 +7,10 @@ from pathlib import Path
 
 from daq.bench import loading
 from daq.bench.model import Bench
+from daq.caveats import Caveat, Caveats
 from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_names, driver_type
-from daq.transport.ports import is_simulated as is_simulated_port
+from daq.transport import ports
 
 
 class InstalledDrivers(Mapping[str, AnyDriver]):
@@ -30,9 +31,10 @@ class InstalledDrivers(Mapping[str, AnyDriver]):
         return len(driver_names())
 
 
-def is_simulated(bench: Bench) -> bool:
-    """Whether simulated devices serve the ports of a bench, by its file or on this machine now."""
-    return bench.runs_simulated or any(map(is_simulated_port, bench.ports()))
+def caveats_of(bench: Bench) -> Caveats:
+    """Return those of recordings of a bench, by its file and by what serves its ports here now."""
+    own = Caveats.of({Caveat.SIMULATED: bench.runs_simulated})
+    return Caveats.joined([own, *map(ports.caveats_of, bench.ports())])
 
 
 def load(path: str | Path) -> Bench:

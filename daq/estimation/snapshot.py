@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.sensitivity import Sensitivities
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.clocks.clock_model import ClockState
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
@@ -259,8 +260,8 @@ class Snapshot:
         Share of the data's PSD by which the noise may be off, because cross-spectra were rounded.
     sensitivities : mapping of (str, str) to KnownSensitivity
         What is known of sensitivities, by names of sensor and channel; not in it: nothing.
-    simulated : bool
-        Whether a sensor was simulated: the noise is that of no real one.
+    caveats : Caveats
+        What must be read before its numbers.
     channel_segments : tuple of int
         Segments behind the noise of each channel, where some channels have no samples in some
         segments; empty where all rest on the same ones.
@@ -303,7 +304,7 @@ class Snapshot:
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0
     sensitivities: Sensitivities = field(default_factory=dict)
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
     channel_segments: tuple[int, ...] = ()
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     parts: Parts | None = None

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.sensitivity import Sensitivities
+from daq.caveats import Caveats
 from daq.clocks.sensor_reader import main_columns
 from daq.estimation.blas_threads import one_blas_thread
 from daq.estimation.contributions import with_contributions
@@ -357,7 +358,7 @@ class SnapshotBuilder:
             not_estimated=left,
             across_axes=self._axes,
             sensitivities=_sensitivities(recordings),
-            simulated=any(recording.simulated for recording in recordings),
+            caveats=Caveats.joined(recording.caveats for recording in recordings),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, counting) if final else None
             ),

@@ -16,6 +16,7 @@ import numpy as np
 
 from daq.bench.channel import Channel
 from daq.bench.units import canonical
+from daq.caveats import NO_CAVEATS
 from daq.errors import ArrayError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches
 from daq.formats.memory import RecordingInMemory, SensorInMemory
@@ -96,7 +97,7 @@ def recording_of_arrays(
     given = _sensors(sensors, sampling_rate, channels)
     _check_together(given)
     in_memory = [_in_memory(each, unit, responses) for each in given]
-    return RecordingInMemory(in_memory, NAME, simulated=getattr(sensors, "simulated", False))
+    return RecordingInMemory(in_memory, NAME, caveats=getattr(sensors, "caveats", NO_CAVEATS))
 
 
 def _sensors(sensors: object, rate: object, channels: Sequence[str] | None) -> list[_Sensor]:

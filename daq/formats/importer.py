@@ -20,17 +20,17 @@ from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Sensor
 from daq.bench.option_fit import misfits
 from daq.bench.units import canonical
+from daq.caveats import Caveat, Caveats
 from daq.errors import ImportFormatError, WrongSettingError
 from daq.formats.assembly import Columns
 from daq.formats.defaults import from_files, still_chosen
 from daq.formats.memory import RecordingInMemory, SensorInMemory
-from daq.formats.miniseed_export import SIMULATED_COMMENT
 from daq.formats.readers.fdsn import FDSN, fetch
 from daq.formats.readers.packed import is_packed, unpacked
 from daq.formats.sources import Selection, open_sources
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import BLOCK_ROWS, ArrayWriter
-from daq.recording.file_format import SIMULATED, SensorLayout
+from daq.recording.file_format import SensorLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -241,7 +241,7 @@ def _import(
         written,
         sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
         created=HostTime(start, start),
-        attributes={"origin": _origin(sources.given), **_simulated(sources)},
+        attributes={"origin": _origin(sources.given), **dict.fromkeys(_caveats(sources), 1)},
         chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
     ) as writer:
         _write(writer, tuple(found.values()))
@@ -297,21 +297,21 @@ def open_files(
     sensors = [SensorInMemory(each, described[name].channels) for name, each in found.items()]
     imported = tuple(_imported(each) for each in found.values())
     result = ImportResult(imported, opened.problems, opened.left_aside, taken)
-    simulated = bool(_simulated(fetched))
-    return RecordingInMemory(sensors, _origin(sources), simulated=simulated), result
+    return RecordingInMemory(sensors, _origin(sources), caveats=_caveats(fetched)), result
 
 
-def _simulated(sources: _Sources) -> dict[str, str | float]:
-    """Return the mark of simulated sensors, if responses or StationXML beside the files have it."""
+def _caveats(sources: _Sources) -> Caveats:
+    """Return the caveats that responses or StationXML beside the files have."""
+    found: set[Caveat] = set()
     files = [Path(each) for each in (*sources.files, *sources.responses) if _is_path(each)]
     for given in (*files, *(each.with_suffix(".xml") for each in files)):
         inside = given.rglob("*.xml") if given.is_dir() else (given,)
         for file in inside:
             if file.suffix == ".xml" and file.is_file():
                 with file.open("rb") as content:
-                    if SIMULATED_COMMENT.encode() in content.read(_MAX_STATION_XML):
-                        return {SIMULATED: 1}
-    return {}
+                    text = content.read(_MAX_STATION_XML)
+                found.update(each for each in Caveat if each.words.comment.encode() in text)
+    return Caveats.joined([found])
 
 
 def _is_path(given: object) -> bool:

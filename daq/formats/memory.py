@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import RecordingError
 from daq.formats.foreign_sensor import ForeignSensor, Stretch
 from daq.protocols.block import BlockFlag, Event, HostTime, Reading
@@ -108,8 +109,7 @@ class RecordingInMemory:
     sensors : sequence of SensorInMemory
     name : str
         What messages call it.
-    simulated : bool
-        Whether a sensor was simulated.
+    caveats : Caveats
     """
 
     closed = True
@@ -118,12 +118,12 @@ class RecordingInMemory:
     readings: tuple[Reading, ...] = ()
 
     def __init__(
-        self, sensors: Sequence[SensorInMemory], name: str, *, simulated: bool = False
+        self, sensors: Sequence[SensorInMemory], name: str, *, caveats: Caveats = NO_CAVEATS
     ) -> None:
         self.sensors = tuple(sensors)
         self.path = Path(name)
         self.run_id = name
-        self.simulated = simulated
+        self.caveats = caveats
         start = min(int(sensor.blocks["device_counter"][0]) for sensor in sensors)
         self.created_at = HostTime(start, start)
 

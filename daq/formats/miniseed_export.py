@@ -48,8 +48,6 @@ _STEP = 0.01
 _SHORT_ROWS, _SHORT_RECORD, _RECORD = 500, 512, 4096
 """Rows up to which records are short, and bytes of a record."""
 _STEIM2_LIMIT = 1 << 29
-SIMULATED_COMMENT = "huddle: simulated sensor"
-"""Comment of a station in StationXML, as no part of miniSEED can say so; imports look for it."""
 _BANDS = ((1000.0, "F"), (250.0, "C"), (80.0, "H"), (10.0, "B"), (1.0, "M"), (0.0, "L"))
 """Band codes of broadband channels, by the least rate in Hz (SEED manual, appendix A)."""
 _INSTRUMENTS = {"m/s²": "N", "g": "N", "mg": "N", "µg": "N", "Gal": "N"}
@@ -350,7 +348,7 @@ def _inventory(
                     response=_response(parts, channel, sensor.sampling_rate),
                 )
             )
-    comments = [parts.Comment(SIMULATED_COMMENT)] if recording.simulated else []
+    comments = [parts.Comment(each.words.comment) for each in recording.caveats]
     return parts.Inventory(
         networks=[
             parts.Network(

@@ -28,7 +28,7 @@ from typing import Any, Self, TypeVar
 
 from daq.bench.durations import format_duration
 from daq.bench.model import Bench, Sensor
-from daq.devices.bench_file import is_simulated
+from daq.devices.bench_file import caveats_of
 from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_type
 from daq.errors import DeviceError, DiskError, RecordingError
@@ -41,7 +41,7 @@ from daq.recorder.connection import CLOSE_TIMEOUT, Connection, Item
 from daq.recorder.device_identity import with_owner
 from daq.recording import control
 from daq.recording.control import Command
-from daq.recording.file_format import SIMULATED, SensorLayout
+from daq.recording.file_format import SensorLayout
 from daq.recording.storage.names import CONTINUES, continuation_names
 from daq.recording.writer import Committed, RecordingWriter
 
@@ -326,8 +326,7 @@ class _Recorder:
         )
         attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
         attributes |= self.attributes
-        if is_simulated(self.bench):
-            attributes[SIMULATED] = 1
+        attributes |= dict.fromkeys(caveats_of(self.bench), 1)
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})

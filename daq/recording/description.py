@@ -17,6 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from daq.caveats import Caveat
 from daq.errors import NotARecordingError
 from daq.recording.file_format import fixed, texts
 from daq.recording.sensor_record import CommittedRows
@@ -27,7 +28,7 @@ _DESCRIPTION, _TABLE, _COUNTS = range(3)
 _FILE = (
     *("format", "format_version", "run_id", "created", "created_utc_ns", "created_monotonic_ns"),
     *("software", "bench", "operator", "location", "duration", "until", "estimate", "origin"),
-    "simulated",
+    *Caveat,
 )
 _SENSOR = ("model", "serial_number", "driver", "port", "clock", "sampling_rate", "temperature")
 """Not the firmware, which came later: programs that do not know it would see damage. It is in the

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from daq.bench.channel import Channel
+from daq.caveats import Caveat
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,9 +29,8 @@ what stands there for samples."""
 LIBVER = ("v110", "v110")
 """HDF5 file format of recordings."""
 
-SIMULATED = "simulated"
-"""Origin of a recording made without devices, and the driver of its sensors; the attribute that
-marks a recording of simulated devices."""
+SIMULATED = Caveat.SIMULATED.value
+"""Origin of a recording made without devices, and the driver of its sensors."""
 
 PRIVATE_TABLES = ("hooks", "metrics", "signing", "web")
 """Tables of the bench file that are not recorded."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
 from daq.bench.outline import BenchOutline
+from daq.caveats import Caveats
 from daq.protocols.block import Event, HostTime, Reading
 
 
@@ -113,8 +114,8 @@ class ReadableRecording(Protocol):
         """The bench that was recorded in outline, if there is one."""
 
     @property
-    def simulated(self) -> bool:
-        """Whether a sensor of the recording was simulated."""
+    def caveats(self) -> Caveats:
+        """What must be read before its numbers."""
 
     @property
     def closed(self) -> bool:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.end_condition import NEVER, EndCondition
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.protocols.block import BlockFlag, Event
 from daq.recording.sensor_state import STATE_AFTER, SensorState
 
@@ -86,8 +87,7 @@ class RecordingStatus:
         When it ends by itself.
     speed : float
         Seconds of the recording that pass in one second; 1, unless sensors are simulated.
-    simulated : bool
-        Whether a sensor is simulated.
+    caveats : Caveats
     """
 
     elapsed: float
@@ -97,7 +97,7 @@ class RecordingStatus:
     events: tuple[Event, ...]
     until: EndCondition = NEVER
     speed: float = 1.0
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
 
     def in_local_time(self, seconds: float | None) -> datetime | None:
         """Return the moment so many seconds from now; None if the recording is not in real time."""
@@ -164,7 +164,7 @@ class RecordingMonitor:
             events=self._events,
             until=replace(self._first.until, duration=self._first.duration),
             speed=self._speed,
-            simulated=recording.simulated,
+            caveats=recording.caveats,
         )
 
     def _since_latest(self, latest_ns: int, sensors: tuple[SensorStatus, ...]) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.outline import BenchOutline
+from daq.caveats import Caveat, Caveats
 from daq.errors import BenchFileError, NotARecordingError
 from daq.protocols.block import Event, EventKind, HostTime, Quantity, Reading
 from daq.recording import file_format
@@ -75,7 +76,7 @@ class Recording:
         )
         """What of the live estimate ends the run; the process that records obeys it."""
         self._estimate = text(attributes, "estimate") if "estimate" in attributes else ""
-        self._marked_simulated = bool(attributes.get("simulated", 0))
+        self._marked = Caveats.of(attributes)
         self._origin = text(attributes, "origin") if "origin" in attributes else ""
         self.continues = text(attributes, CONTINUES) if CONTINUES in attributes else ""
         """The ``run_id`` of the recording that this one continues; empty for most."""
@@ -140,14 +141,12 @@ class Recording:
             ) from error
 
     @cached_property
-    def simulated(self) -> bool:
-        """Whether a sensor was simulated; also of recordings older than the attribute."""
-        return (
-            self._marked_simulated
-            or self._origin == SIMULATED
-            or any(sensor.driver == SIMULATED for sensor in self.sensors)
-            or (self.outline is not None and self.outline.is_simulated)
-        )
+    def caveats(self) -> Caveats:
+        """What must be read before its numbers; also of recordings older than the attribute."""
+        origins = {self._origin, *(sensor.driver for sensor in self.sensors)}
+        is_model = self.outline is not None and self.outline.is_simulated
+        found = {SIMULATED} & origins or is_model
+        return Caveats.joined([self._marked, [Caveat.SIMULATED] if found else []])
 
     @cached_property
     def warning(self) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from daq.caveats import Caveats
 from daq.estimation.recording_set import continuations
 from daq.protocols.block import READING_INTERVAL_NS, EventKind, Quantity, Reading
 from daq.recording.reader import Recording
@@ -95,8 +96,7 @@ class Source:
     recording : Recording
         Its description; its file is closed.
     sensors : tuple of RecordedSensor
-    simulated : bool
-        Whether a sensor was simulated.
+    caveats : Caveats
     logged_events : tuple of LoggedEvent
         In time order.
     readings : tuple of Reading
@@ -119,7 +119,7 @@ class Source:
     state: State
     recording: Recording
     sensors: tuple[RecordedSensor, ...]
-    simulated: bool
+    caveats: Caveats
     logged_events: tuple[LoggedEvent, ...]
     readings: tuple[Reading, ...] = ()
     signed_by: str = ""
@@ -190,7 +190,7 @@ def _source(recording: Recording, *, continued: bool) -> Source:
             )
             for sensor in recording.sensors
         ),
-        simulated=recording.simulated,
+        caveats=recording.caveats,
         logged_events=tuple(logged_events),
         readings=recording.readings or _stated_at_start(recording),
         signed_by=signed_by(path) if state == "closed" else "",

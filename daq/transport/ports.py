@@ -33,6 +33,7 @@ from typing import Any, cast
 
 import serial
 
+from daq.caveats import Caveat, Caveats
 from daq.errors import NotConnectedError
 from daq.host_clock import HostClock
 from daq.transport import wire_log
@@ -337,13 +338,13 @@ async def open_port(
         await wire.close()
 
 
-def is_simulated(port: str) -> bool:
-    """Whether simulated devices on this machine serve the port now, whatever the bench file says.
+def caveats_of(port: str) -> Caveats:
+    """Return whether simulated devices here serve a port now, whatever the bench file says.
 
     A simulated device speaks the real protocol: nothing in its bytes says that it is simulated.
     So its server lists its ports in a file of its folder (``sim_devices.server.launch``).
     """
-    return is_virtual(port) or bool(simulation_of(port))
+    return Caveats.of({Caveat.SIMULATED: is_virtual(port) or simulation_of(port)})
 
 
 def simulation_of(port: str) -> dict[str, Any]:

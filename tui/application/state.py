@@ -9,7 +9,8 @@ from typing import Final
 
 from daq.bench.masks.mask import Mask
 from daq.bench.model import Bench
-from daq.devices.bench_file import is_simulated
+from daq.caveats import Caveats
+from daq.devices.bench_file import caveats_of
 from daq.estimation.snapshot import Snapshot
 from daq.recording.monitor import RecordingStatus
 from daq.results.result import Result
@@ -87,11 +88,12 @@ class State:
         return None if self.result is None else self.result.snapshot
 
     @property
-    def is_simulated(self) -> bool:
-        """Whether a sensor of the recording, or else of the bench, is simulated."""
-        if self.snapshot is not None or self.now is not None:
-            return any(each is not None and each.simulated for each in (self.snapshot, self.now))
-        return self.bench is not None and is_simulated(self.bench)
+    def caveats(self) -> Caveats:
+        """Those of the recording, or else of the bench."""
+        known = [each.caveats for each in (self.snapshot, self.now) if each is not None]
+        if not known and self.bench is not None:
+            known = [caveats_of(self.bench)]
+        return Caveats.joined(known)
 
     @property
     def has_result(self) -> bool:

@@ -161,13 +161,13 @@ def status_line(state: State, view: str, *, width: int) -> Text:
             doing = Text.assemble(doing[:1], doing[doing.plain.find("  ") + 1 :])
         words = f"  {WORDS[verdict.verdict]}"
         doing.append_text(styled(in_tone(words, verdict, grows=not state.has_result)))
-    simulated = Text(" SIMULATED ", f"{BAD} reverse") if state.is_simulated else Text()
+    caveats = Text(f" {state.caveats.after().upper()} " if state.caveats else "", f"{BAD} reverse")
     line = _tabs(view, has_titles=width >= ALL_TABS)
-    if line.cell_len + simulated.cell_len + doing.cell_len > width - 4 >= ALL_TABS - 4:
+    if line.cell_len + caveats.cell_len + doing.cell_len > width - 4 >= ALL_TABS - 4:
         line = _tabs(view, has_titles=False, has_numbers=True)
     line.append(" ")
-    if simulated:
-        line.append_text(simulated).append(" ")
+    if caveats:
+        line.append_text(caveats).append(" ")
     room = width - 2 - line.cell_len - doing.cell_len
     if len(state.name) + 2 <= room:
         line.append(f"{state.name}  ", "bold")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
 from daq.bench.units import in_si
+from daq.caveats import Caveats
 from daq.protocols.block import Quantity
 from daq.results.decision.conformity import Conformity, Statement, conformity, with_rule
 from daq.results.sources import Condition, Source, conditions
@@ -104,8 +105,8 @@ def _administrative(
     lines = [certificate.SCOPE, f"Traceability: {table.traceability or 'not given'}"]
     if laboratory.accreditation:
         lines.append(laboratory.accreditation)
-    if any(source.simulated for source in found):
-        lines.insert(0, "SIMULATED SENSORS: no instrument was measured.")
+    caveats = Caveats.joined(source.caveats for source in found)
+    lines[:0] = [each.words.scope for each in caveats]
     if issue is None or issue.is_specimen:
         what = "DRAFT" if issue is None else certificate.SPECIMEN
         lines.insert(0, f"{what}: not a certificate.")

@@ -156,13 +156,10 @@ def examine(
     about = found[0].bench if order.about is None else order.about
     objections = []
     for source in found:
-        if source.simulated:
-            objections.append(
-                Objection(
-                    f"{source.path}: sensors were simulated: no certificate is issued of a model",
-                    "; --specimen makes a specimen",
-                )
-            )
+        objections += [
+            Objection(f"{source.path}: {each.words.refusal}", "; --specimen makes a specimen")
+            for each in source.caveats
+        ]
         if source.state in {"growing", "left-open"}:
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
             objections.append(Objection(f"{source.path}: not closed; {wanted}"))

@@ -99,16 +99,15 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     ExceptionGroup
         With a DeviceError for every port that failed, after the others have been shown.
     """
-    from daq.devices.bench_file import is_simulated, load
+    from daq.devices.bench_file import caveats_of, load
     from daq.preflight.device_check import Examination
-    from daq.results.facts.recordings import SIMULATED
 
     bench = load(path)
     screen = for_people(json)
     screen.print(_summary(bench))
-    simulated = is_simulated(bench)
-    if simulated:
-        screen.print(SIMULATED)
+    caveats = caveats_of(bench)
+    for caveat in caveats:
+        screen.print(caveat.words.sentence)
     examined = examined_bench(bench) if devices else Examination((), (), ())
     found = examined.found
     if devices:
@@ -130,7 +129,7 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
         json,
         {
             "bench": bench.name,
-            "simulated": simulated,
+            **caveats.keys,
             "sensors": found,
             "checks": check_list.document(examined.rows),
             "errors": [str(error) for error in examined.errors],
@@ -210,12 +209,11 @@ def check_port(port: str, *, json: str | None) -> None:
 
     from daq.host_clock import SystemClock
     from daq.preflight.device_check import discover, search_description
-    from daq.results.facts.recordings import SIMULATED
-    from daq.transport.ports import is_simulated
+    from daq.transport.ports import caveats_of
 
     found = asyncio.run(discover(port, SystemClock()))
-    simulated = is_simulated(port)
-    write_json(json, {"port": port, "simulated": simulated, "devices": found})
+    caveats = caveats_of(port)
+    write_json(json, {"port": port, **caveats.keys, "devices": found})
     if not found:
         raise NoAnswerError(
             f"port {port}: no reply as {search_description(port)}; check power and cable; for other"
@@ -230,8 +228,8 @@ def check_port(port: str, *, json: str | None) -> None:
         settings = ", ".join(f"{key} = {value}" for key, value in device.settings.items())
         rows.append((device.driver, settings, remark))
     screen = for_people(json)
-    if simulated:
-        screen.print(SIMULATED)
+    for caveat in caveats:
+        screen.print(caveat.words.sentence)
     screen.print(Table.of(("driver", "settings", "device"), rows))
     for device in found:
         if device.driver == "text":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daq.caveats import Caveat
 from tui.commands.options import OutOption, command
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".svg", ".pdf")
 _COLUMNS = (
     *("serial_number", "sensor", "channel", "model", "bench", "due", "method", "unit"),
-    *("low_hz", "high_hz", "psd", "low", "high", "simulated"),
+    *("low_hz", "high_hz", "psd", "low", "high", *Caveat),
 )
 
 
@@ -159,5 +160,5 @@ def _noise(sources: list[Path], sensor: str, since: datetime | None) -> list[Fou
 def _rows(found: Sequence[NoiseSeries]) -> Iterator[list[object]]:
     for series in found:
         for (bench, due), noise in zip(series.runs, series.noise, strict=True):
-            own = {"bench": bench, "due": utc_text(due), "simulated": series.simulated}
+            own = {"bench": bench, "due": utc_text(due), **series.caveats.keys}
             yield [own[name] if name in own else getattr(noise, name) for name in _COLUMNS]

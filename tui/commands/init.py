@@ -128,7 +128,7 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
     import asyncio
 
     from daq.preflight.device_check import network_ports
-    from daq.transport.ports import is_simulated
+    from daq.transport.ports import caveats_of
     from daq.transport.serial_ports import serial_ports
 
     searched = list(ports) or [port.path for port in serial_ports()]
@@ -156,8 +156,7 @@ def _search(ports: Sequence[str], *, is_asked: bool) -> tuple[list[str], list[Di
         for device in answer:
             about = device.information
             what = device.remark if about is None else f"{about.model} {about.serial_number}"
-            simulated = ", simulated" if is_simulated(port) else ""
-            screen.print(f"{port}: {device.driver}, {what}{simulated}")
+            screen.print(caveats_of(port).after(f"{port}: {device.driver}, {what}"))
         if not answer:
             screen.print(f"{port}: no reply")
         found += answer

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from daq.caveats import Caveat
 from daq.errors import HuddleError
 from tui.commands.options import command
 from tui.output.console import check_places, for_people, write_json, write_text
@@ -26,7 +27,7 @@ PAGE = 100
 """Runs that are listed unless another number is given."""
 _COLUMNS = (
     *("bench", "entry", "due", "state", "verdict", "started", "ended", "duration"),
-    *("recordings", "simulated", "pinned", "removed", "reason"),
+    *("recordings", *Caveat, "pinned", "removed", "reason"),
 )
 
 
@@ -114,7 +115,7 @@ class RunNotFoundError(HuddleError):
 
 
 def _row(run: Run) -> list[Cell]:
-    marks = {"simulated": run.simulated, "pinned": run.pinned, "removed": run.removed}
+    marks = {**run.caveats.keys, "pinned": run.pinned, "removed": run.removed}
     notes = ", ".join(name for name, holds in marks.items() if holds)
     kept = (", ".join(run.parts) or "-") + (f" ({notes})" if notes else "")
     about = (f"{run.due:%Y-%m-%d %H:%M}", run.entry, run.state, run.verdict or "-")

@@ -69,15 +69,14 @@ class _Lines:
         self._says_why = False
 
     def status(self, status: RecordingStatus) -> None:
-        from daq.results.facts.recordings import SIMULATED
         from estimator.wording import clock_time
 
         before, self._now = self._now, status
         events = status.events[self._n_events :]
         self._n_events = len(status.events)
         if before is None:  # events from before
-            if status.simulated and self._json is None:
-                console().print(SIMULATED, soft_wrap=True)
+            for caveat in status.caveats if self._json is None else ():
+                console().print(caveat.words.sentence, soft_wrap=True)
             return
         for event in events:
             at = (event.received.utc_ns - status.started_utc_ns) * 1e-9
@@ -161,7 +160,7 @@ def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
         "time_left_for": left.goal,
         "ends_too_early_for": left.short_of,
         "closed": snapshot.closed,
-        "simulated": snapshot.simulated,
+        **snapshot.caveats.keys,
         "sensors": {
             sensor.name: {
                 "state": sensor.state,

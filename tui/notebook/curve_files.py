@@ -190,7 +190,7 @@ def _write_uff(snapshot: Snapshot, path: Path, said: Said) -> None:
                         id2=f"one-sided, ({_ascii(label.unit)})^2/Hz"[:80],
                         id3=f"{said['source']}; {span}"[:80],
                         id4=f"SHA-256 {digest}"[:80] if digest else "NONE",
-                        id5="SIMULATED SENSORS" if said["simulated"] == "true" else "NONE",
+                        id5=snapshot.caveats.nouns().upper() or "NONE",
                         rsp_ent_name=_ascii(label.sensor)[:10],
                         rsp_node=nodes[label.sensor],
                         rsp_dir=_DIRECTIONS.get(label.channel[-1:].upper(), 0),

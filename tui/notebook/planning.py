@@ -369,8 +369,8 @@ def _positions(bench: Bench) -> FloatArray | None:
     if not bench.has_scenario:
         return None
     scenario = scenario_of(bench)
-    simulated = np.array([scenario.sensors[sensor.name].position for sensor in bench.sensors])
-    return simulated if simulated.any() else None
+    found = np.array([scenario.sensors[sensor.name].position for sensor in bench.sensors])
+    return found if found.any() else None
 
 
 def _leakage(bench: Bench, settings: Settings, snr: float) -> Leakage | None:

@@ -270,9 +270,8 @@ class RecordingFile(SampledSensors):
     def __repr__(self) -> str:
         with Recording.open(self.path) as recording:
             state = "" if recording.closed else ", not closed"
-            state += ", simulated sensors" if recording.simulated else ""
             head = f"Recording {self.path}, {utc(recording.created_at.utc_ns)}{state}"
-            return "\n".join([head, *map(_line, recording.sensors)])
+            return "\n".join([recording.caveats.nouns(head), *map(_line, recording.sensors)])
 
 
 class Waveforms(SampledSensors):
@@ -310,8 +309,8 @@ class Waveforms(SampledSensors):
         return self_noise(self, **options)
 
     def __repr__(self) -> str:
-        simulated = ", simulated sensors" if self.recording.simulated else ""
-        lines = [f"Waveforms of {self.recording.path}, {utc(self._created_ns)}{simulated}"]
+        head = f"Waveforms of {self.recording.path}, {utc(self._created_ns)}"
+        lines = [self.recording.caveats.nouns(head)]
         lines += map(_line, self.recording.sensors)
         for each in self._imported:
             lines += [

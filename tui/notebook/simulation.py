@@ -11,6 +11,7 @@ import numpy as np
 
 from daq.bench.durations import format_duration, parse_duration
 from daq.bench.model import Bench
+from daq.caveats import Caveat, Caveats
 from daq.errors import WrongSettingError
 from estimator.types import FloatArray
 from sim_devices.errors import ScenarioError
@@ -32,11 +33,11 @@ class Simulation(Mapping[str, "FloatArray"]):
     scenario : Scenario
     duration : float
         In seconds.
-    simulated : bool
-        Always true; estimates say so.
+    caveats : Caveats
+        That it is simulated; estimates say so.
     """
 
-    simulated = True
+    caveats = Caveats([Caveat.SIMULATED])
 
     def __init__(self, bench: Bench, scenario: Scenario, duration: float) -> None:
         self.scenario = scenario

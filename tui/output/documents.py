@@ -85,7 +85,13 @@ class SensorDocument(TypedDict):
     channels: Annotated[list[RecordedChannelDocument], "Channels."]
 
 
-class RecordingDocument(TypedDict):
+class CaveatsDocument(TypedDict):
+    """`daq.caveats.Caveats` of a recording."""
+
+    simulated: Annotated[bool, "Whether a sensor was simulated."]
+
+
+class RecordingDocument(CaveatsDocument):
     """One recording."""
 
     file: Annotated[str, "Name of the file, without its folder."]
@@ -111,7 +117,6 @@ class RecordingDocument(TypedDict):
     operator: Annotated[str | None, "Operator."]
     location: Annotated[str | None, "Location."]
     bench: Annotated[str | None, "Name of the bench; null for imported files without one."]
-    simulated: Annotated[bool, "Whether a sensor was simulated."]
     conditions: Annotated[
         list[ConditionDocument], "What devices and computer stated, read once a minute."
     ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from daq.bench.estimate_settings import table_keys
 from daq.protocols.block import Quantity
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from estimator.checks.stability import Stability
     from tui.output.documents import (
         BandMeanDocument,
+        CaveatsDocument,
         DiagnosticsDocument,
         EstimateDocument,
         FactDocument,
@@ -133,7 +134,7 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
         "unit_of_densities": f"({snapshot.unit})²/Hz",
         "verdict": "none" if result.verdict is None else result.verdict.verdict,
         "facts": json_text(facts_document(result.all_facts)),
-        "simulated": str(snapshot.simulated).lower(),
+        **{key: str(holds).lower() for key, holds in snapshot.caveats.keys.items()},
         "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),
         "settings": json.dumps(_settings(result), ensure_ascii=False),
         "recordings": json.dumps(recordings, ensure_ascii=False),
@@ -157,7 +158,7 @@ def _recording(source: Source) -> RecordingDocument:
         "software": source.software,
         "operator": source.operator or None,
         "location": source.location or None,
-        "simulated": source.simulated,
+        **cast("CaveatsDocument", source.caveats.keys),
         "bench": None if bench is None else bench.name,
         "conditions": [
             {

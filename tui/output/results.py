@@ -68,9 +68,7 @@ def averages_line(snapshot: Snapshot) -> str:
     )
     if len(snapshot.octaves) > 1:
         text += f" above {snapshot.octaves[-1].low:.3g} Hz"
-    if snapshot.simulated:
-        text += ", simulated sensors"
-    return text
+    return snapshot.caveats.nouns(text)
 
 
 def _not_a_formula(text: str) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import to_table
 from daq.bench.tables.certificate import CertificateTable, Customer, Laboratory
+from daq.caveats import Caveats
 from daq.estimation.settings import Settings
 from daq.protocols.block import Quantity
 from daq.results.sources import Condition, Source, conditions
@@ -254,10 +255,8 @@ def notices(
 ) -> tuple[Paragraph, ...]:
     """Return what must be read before the numbers."""
     settings = result.settings
-    lines: list[Paragraph] = []
-    if any(source.simulated for source in found):
-        text = "SIMULATED SENSORS: the noise is that of a model. No instrument was measured."
-        lines.append(Paragraph(text, "bad"))
+    caveats = Caveats.joined(source.caveats for source in found)
+    lines = [Paragraph(each.words.warning, "bad") for each in caveats]
     if issue is None:
         text = "DRAFT: not a certificate. huddle issue makes one."
         left = len(missing(bench, found[0]))
@@ -316,8 +315,8 @@ def watermark(found: Sequence[Source], issue: Issue | None) -> str:
     """Return what stands across every page."""
     if issue is not None and issue.is_specimen:
         return SPECIMEN
-    simulated = any(source.simulated for source in found)
-    return "SIMULATED" if simulated else "DRAFT" if issue is None else ""
+    caveats = Caveats.joined(source.caveats for source in found)
+    return caveats.after().upper() or ("DRAFT" if issue is None else "")
 
 
 def parties(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -> list[Part]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import HuddleError, RecordingError
 from daq.recorder.retention import remove_run
 from daq.recording.reader import Recording
@@ -31,8 +32,7 @@ class Entry:
     bench : str
         Name of the bench; empty for an imported recording.
     operator : str
-    is_simulated : bool
-        Whether a sensor was simulated.
+    caveats : Caveats
     length : float
         Of the longest sensor, in seconds.
     is_growing : bool
@@ -59,7 +59,7 @@ class Entry:
     created: datetime | None = None
     bench: str = ""
     operator: str = ""
-    is_simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
     length: float = 0.0
     is_growing: bool = False
     is_closed: bool = False
@@ -74,8 +74,8 @@ class Entry:
 
     @property
     def place(self) -> str:
-        """The bench, and whether its sensors are simulated."""
-        return ", ".join(filter(None, (self.bench, "simulated" if self.is_simulated else "")))
+        """The bench, and its caveats."""
+        return self.caveats.after(self.bench)
 
 
 def catalogue(
@@ -165,7 +165,7 @@ def _entry(path: Path, size: int, modified_ns: int) -> Entry:
                 created=recording.created,
                 bench="" if bench is None else bench.name,
                 operator=recording.operator,
-                is_simulated=recording.simulated,
+                caveats=recording.caveats,
                 length=max(lengths),
                 is_growing=not recording.closed and is_being_written(path),
                 is_closed=recording.closed,

@@ -100,11 +100,11 @@ def _identities(folder: Path, run: Run) -> Iterator[tuple[str, str, str]]:
 def _run_of(bench: Bench, path: Path) -> Run | None:
     """Return the run of a recording; None if the service did not make it."""
     with Recording.open(path) as recording:
-        created, is_simulated = recording.created.astimezone(UTC), recording.simulated
+        created, caveats = recording.created.astimezone(UTC), recording.caveats
         about = recording.about_results()
         own = recording.bench
     if RUN in about:
-        run = replace(Run.of_record(json.loads(about[RUN])), simulated=is_simulated)
+        run = replace(Run.of_record(json.loads(about[RUN])), caveats=caveats)
         return run if path.name in run.parts else None
     if not mark_of(path).exists() or own is None or own.name != bench.name:
         return None

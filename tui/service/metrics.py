@@ -7,6 +7,7 @@ import platform
 import threading
 from typing import TYPE_CHECKING, Any
 
+from daq.caveats import Caveat
 from daq.errors import HuddleError
 from estimator.decision.verdict import Verdict
 from tui import __version__
@@ -178,6 +179,6 @@ def _result(core: Any, run: Run) -> Iterator[Any]:  # noqa: ANN401 - a module
     for known in Verdict if run.verdict else ():
         verdict.add_metric([known.value], known.value == run.verdict)
     yield verdict
-    yield core.GaugeMetricFamily(
-        "huddle_simulated", "Whether a sensor of the last run was simulated.", value=run.simulated
-    )
+    for caveat in Caveat:
+        about = f"Whether the last run has {caveat.words.noun}."
+        yield core.GaugeMetricFamily(f"huddle_{caveat}", about, value=caveat in run.caveats)

@@ -461,7 +461,7 @@ class Service:
             RunState.DONE,
             verdict=outcome.verdict,
             noise=outcome.noise,
-            simulated=outcome.simulated,
+            caveats=outcome.caveats,
             ended=self._clock.now(),
         )
 

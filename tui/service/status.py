@@ -10,6 +10,7 @@ from typing import Any
 
 from daq.bench.durations import format_duration
 from daq.bench.model import Bench
+from daq.caveats import Caveats
 from daq.errors import HuddleError
 from daq.recording.control import ask
 from tui.service.clock import SystemTime
@@ -86,7 +87,7 @@ def status_lines(found: dict[str, Any]) -> Iterator[str]:
         text = "none" if run is None else f"{run['entry']} of {run['due']}"
         if run is not None and key == "last":
             text += f": {run['state']}" + (f", {run['verdict']}" if run["verdict"] else "")
-            text += ", simulated" if run["simulated"] else ""
+            text = Caveats.of(run).after(text)
             text += f" ({run['reason']})" if run["reason"] else ""
         yield f"{key + ' run':<10} {text}"
     disk = found["disk"]

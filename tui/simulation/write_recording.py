@@ -77,7 +77,7 @@ def simulate_recording(
             bench,
             world,
             duration=seconds,
-            simulated=lambda s: bar.update(task, completed=s),
+            progress=lambda s: bar.update(task, completed=s),
         )
     for_people(json).print(f"{out}: {seconds:g} s of {', '.join(world.names)}, simulated")
     write_json(
@@ -97,7 +97,7 @@ def write(
     scenario: Scenario,
     *,
     duration: float,
-    simulated: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> None:
     """Write a recording whose blocks were received as their last samples were taken.
 
@@ -111,7 +111,7 @@ def write(
         Holds every sensor of the bench.
     duration
         In seconds.
-    simulated
+    progress
         Receives the number of finished seconds.
     """
     world = World(scenario)
@@ -124,15 +124,15 @@ def write(
         attributes={"origin": SIMULATED},
         chunk_seconds=CHUNK_SECONDS,
     ) as writer:
-        writer.event(EventKind.STARTED, "simulated")
+        writer.event(EventKind.STARTED, SIMULATED)
         for first in np.arange(0.0, duration, CHUNK_SECONDS):
             last = min(first + CHUNK_SECONDS, duration)
             for layout in layouts.values():
                 begin, end = (round(at * layout.sampling_rate) for at in (first, last))
                 _write_samples(writer, world, layout, begin, end)
-            if simulated is not None:
-                simulated(last)
-        writer.event(EventKind.STOPPED, "simulated", at_ns=round(duration * 1e9))
+            if progress is not None:
+                progress(last)
+        writer.event(EventKind.STOPPED, SIMULATED, at_ns=round(duration * 1e9))
 
 
 def _write_samples(

@@ -83,8 +83,8 @@ class Ingredients:
     def csm(self, n_segments: int) -> tuple[ComplexArray, int]:
         """Return the matrix (n_freqs, 8, 8) within BAND, and how many segments it has."""
         if n_segments not in self._matrices:
-            simulated = max(1, round(n_segments * self._length))
-            self._matrices[n_segments] = self._simulate(simulated), simulated
+            n_used = max(1, round(n_segments * self._length))
+            self._matrices[n_segments] = self._simulate(n_used), n_used
         return self._matrices[n_segments]
 
     def _simulate(self, n_segments: int) -> ComplexArray:

@@ -31,7 +31,7 @@ def about_test(state: State, settings_table: Mapping[str, Any]) -> dict[str, Any
     differences = None if state.reference is None else _differences(state)
     return {
         "title": state.name,
-        "is_simulated": state.is_simulated,
+        "caveats": state.caveats,
         "verdict": verdict,
         "headline": "" if decision is None else str(decision),
         "todo": [] if decision is None else decision.remarks,

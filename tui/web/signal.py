@@ -205,7 +205,7 @@ def drawn(opened: Opened, look: SignalLook, snapshot: Snapshot | None) -> dict[s
             for n, mark in enumerate(chosen)
         ],
         "averages": "" if snapshot is None else averages_line(snapshot),
-        "is_simulated": signal.recording.simulated,
+        "caveats": signal.recording.caveats,
     }
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
+from daq.caveats import Caveat
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import SensorTotals, Snapshot
 from daq.recording.monitor import RecordingStatus
@@ -16,7 +17,6 @@ from estimator.checks.advice import Rank
 from estimator.records import Seconds, record
 from estimator.wording import Words, clock_time, listed, several, time_of_day
 
-SIMULATED = "Simulated sensors: the noise is that of a model, not of instruments."
 LEAST_SHARE = 0.01
 """Share of the noise from which a contribution to an interval is a fact; of the time, too."""
 
@@ -32,7 +32,11 @@ class SensorsSimulated(Fact):
     name: ClassVar[str] = "sensors-simulated"
 
     def _words(self) -> Words:
-        return Words(SIMULATED.rstrip("."), SIMULATED)
+        sentence = Caveat.SIMULATED.words.sentence
+        return Words(sentence.rstrip("."), sentence)
+
+
+_OF_CAVEATS: Mapping[Caveat, type[Fact]] = {Caveat.SIMULATED: SensorsSimulated}
 
 
 @record
@@ -201,8 +205,8 @@ class SensorClipping(Fact):
 
 def facts_of_recordings(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield what the recordings are of, and what they lack."""
-    if snapshot.simulated:
-        yield SensorsSimulated(rank=Rank.TO_KNOW)
+    for caveat in snapshot.caveats:
+        yield _OF_CAVEATS[caveat](rank=Rank.TO_KNOW)
     for sensor in snapshot.sensors:
         if sensor.is_lost:
             yield _lost(snapshot, sensor)

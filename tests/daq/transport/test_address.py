@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from daq.transport.address import is_same_port
-from daq.transport.ports import is_simulated
+from daq.transport.ports import caveats_of
 
 
 @pytest.mark.parametrize(
@@ -44,5 +44,5 @@ def test_other_ports_are_not(port: str, served: str) -> None:
 
 
 def test_a_can_bus_without_an_adapter_is_simulated() -> None:
-    assert is_simulated("can://vcan0")
-    assert not is_simulated("can://can0")
+    assert caveats_of("can://vcan0")
+    assert not caveats_of("can://can0")

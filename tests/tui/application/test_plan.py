@@ -12,6 +12,7 @@ from textual.events import Key
 from daq.bench.editing import with_values
 from daq.bench.end_condition import EndCondition
 from daq.bench.model import Limit
+from daq.caveats import Caveat, Caveats
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, HuddleError
 from daq.recording.sensor_state import SensorState
@@ -85,7 +86,7 @@ def test_the_line_at_the_top_of_a_small_terminal_has_the_whole_verdict() -> None
     result = Result(made_snapshot(), SETTINGS, bench)
     verdict = result.verdict
     assert verdict is not None
-    now = replace(made_now(), simulated=True)
+    now = replace(made_now(), caveats=Caveats([Caveat.SIMULATED]))
     for decision in Verdict:
         state = State("pier", now=now, result=judged(result, replace(verdict, verdict=decision)))
         line = status_line(state, TEST, width=80).plain

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.caveats import Caveat, Caveats
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.result import Result
@@ -151,7 +152,7 @@ def test_all_cells_of_two_methods_and_free_clocks_are_as_kept(share: float) -> N
 def test_one_simulated_recording_makes_the_report_one_of_a_model(reported: Reported) -> None:
     (real,) = sources([reported.recording])
     assert watermark([real], None) == "DRAFT"
-    both = [real, replace(real, simulated=True)]
+    both = [real, replace(real, caveats=Caveats([Caveat.SIMULATED]))]
     assert watermark(both, None) == "SIMULATED"
     first, *_ = notices(both, reported.result, None, None)
     assert first.text.startswith("SIMULATED SENSORS")

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import huddle
 from daq.archive.index import ROLLUP
+from daq.caveats import NO_CAVEATS, Caveat, Caveats
 from daq.recording.reader import Recording
 from daq.results.result import Result
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_now, made_snapshot
@@ -22,6 +23,17 @@ from tui.application.view import status_line
 from tui.commands.main import app
 from tui.report.figures.archive import days_figure
 from tui.report.figures.curves import noise_plots
+
+SIMULATED = Caveats([Caveat.SIMULATED])
+
+
+@pytest.mark.parametrize("caveats", [NO_CAVEATS, SIMULATED])
+def test_caveats_stay_what_they_are_in_files_and_words(caveats: Caveats) -> None:
+    assert Caveats.of(json.loads(json.dumps(caveats.keys))) == caveats
+    assert Caveats.joined([NO_CAVEATS, caveats, caveats]) == caveats
+    assert all(each.words.noun in caveats.nouns("9 segments") for each in caveats)
+    assert caveats.after("pier") == ", ".join(["pier", *caveats])
+    assert caveats.after() == ", ".join(caveats)
 
 
 @pytest.mark.usefixtures("empty_figures")
@@ -55,7 +67,7 @@ def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Pat
     taken = run.invoke(app, ["import", str(out), "--out", str(back)])
     assert taken.exit_code == 0, taken.output
     with Recording.open(back) as imported:
-        assert imported.simulated
+        assert imported.caveats
     assert "simulated sensors" in repr(huddle.open(back))
     assert "simulated sensors" in repr(huddle.read(out))
     out.with_suffix(".xml").unlink()
@@ -88,7 +100,7 @@ def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
 def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
     simulation = huddle.simulate("fig4", duration="40s")
     result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
-    assert result.snapshot.simulated
+    assert result.snapshot.caveats
     assert "simulated" in repr(result)
     plots = noise_plots(result.result)
     assert plots[0].title == "Simulated sensors"
@@ -97,16 +109,16 @@ def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
 def test_the_status_line_of_every_view_says_simulated() -> None:
     snapshot = made_snapshot()
     for view in VIEWS:
-        for simulated in (True, False):
-            state = State("pier", now=replace(made_now(), simulated=simulated))
+        for caveats in (SIMULATED, NO_CAVEATS):
+            state = State("pier", now=replace(made_now(), caveats=caveats))
             shown = status_line(state, view, width=100).plain
-            assert ("SIMULATED" in shown) == simulated
-        state = State("pier", result=Result(replace(snapshot, simulated=True), SETTINGS))
+            assert ("SIMULATED" in shown) == bool(caveats)
+        state = State("pier", result=Result(replace(snapshot, caveats=SIMULATED), SETTINGS))
         assert "SIMULATED" in status_line(state, view, width=80).plain
     bench = demo_bench().model_copy(update={"simulation": {}})
-    assert not State("pier", bench=bench).is_simulated
+    assert not State("pier", bench=bench).caveats
     simulated_bench = bench.model_copy(update={"simulation": {"clock": "clock.json"}})
-    assert State("pier", bench=simulated_bench).is_simulated
+    assert State("pier", bench=simulated_bench).caveats
 
 
 def test_a_measured_recording_is_not_simulated(tmp_path: Path) -> None:
@@ -114,6 +126,6 @@ def test_a_measured_recording_is_not_simulated(tmp_path: Path) -> None:
 
     path = record(tmp_path / "night.h5")
     with Recording.open(path) as recording:
-        assert not recording.simulated
+        assert not recording.caveats
     with h5py.File(path) as file:
         assert "simulated" not in file.attrs

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.caveats import Caveat, Caveats
 from daq.protocols.block import HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.signing import identity, make_key, problem, signed_by
@@ -43,9 +44,11 @@ def done_run(place: Place, part: str = "r.h5") -> Run:
     assert outcome.error == ""
     assert outcome.noise
     ended = run.due + timedelta(seconds=run.duration)
-    assert Outcome.of(json.dumps(asdict(outcome))).simulated  # as its bench says
+    assert Outcome.of(json.dumps(asdict(outcome))).caveats == Caveats(
+        [Caveat.SIMULATED]
+    )  # as its bench says
     done = run.to(RunState.DONE, verdict=outcome.verdict, noise=outcome.noise, ended=ended)
-    return replace(done, simulated=outcome.simulated)
+    return replace(done, caveats=outcome.caveats)
 
 
 def damage_page(path: Path, page: int, rng: np.random.Generator) -> None:

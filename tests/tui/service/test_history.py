@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.caveats import Caveat, Caveats
 from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, FloatArray, changes
 from tests.tui.service.bench_files import START
 from tui.commands.main import app
@@ -147,8 +148,8 @@ def test_a_second_change_is_found_after_the_first() -> None:
     assert found[1].shift == pytest.approx(-4 * DECIBEL)
 
 
-def noise_of(runs: list[Run]) -> list[tuple[str, datetime, RecordedNoise, bool]]:
-    return [(run.bench, run.due, noise, run.simulated) for run in runs for noise in run.noise]
+def noise_of(runs: list[Run]) -> list[tuple[str, datetime, RecordedNoise, Caveats]]:
+    return [(run.bench, run.due, noise, run.caveats) for run in runs for noise in run.noise]
 
 
 def run_with(
@@ -175,7 +176,10 @@ def test_serial_numbers_tie_benches_together_and_intervals_at_zero_are_left_out(
 
 
 def test_simulated_runs_are_compared_with_their_like_only() -> None:
-    runs = [replace(run_with(day, 3.0 * (day % 2)), simulated=day % 2 > 0) for day in range(40)]
+    runs = [
+        replace(run_with(day, 3.0 * (day % 2)), caveats=Caveats([Caveat.SIMULATED] * (day % 2)))
+        for day in range(40)
+    ]
     real, simulated = history(noise_of(runs))
     assert not real.changes
     assert not simulated.changes

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from daq.bench.tables.unattended import Metrics
+from daq.caveats import Caveat, Caveats
 from estimator.decision.verdict import Verdict
 from tests.tui.service.bench_files import HOURLY, Place
 from tests.waiting import limit
@@ -91,7 +92,9 @@ async def test_metrics_show_runs_sensors_and_disk(
     await asyncio.sleep(2 * 3600.0)  # 14:00:30
     noise = RecordedNoise("a", "", "7", "X", "m/s²", "three-sensor", 1.0, 10.0, 4e-12, 3e-12, 5e-12)
     for run in place.changes:
-        metrics.note(replace(run, noise=(noise,), verdict="not-decided", simulated=True))
+        metrics.note(
+            replace(run, noise=(noise,), verdict="not-decided", caveats=Caveats([Caveat.SIMULATED]))
+        )
     with metrics.served(Metrics(port=0)) as port:
         with pytest.raises(MetricsError, match=f"port {port}: Address already in use"):
             metrics.served(Metrics(port=port)).__enter__()

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from daq.caveats import NO_CAVEATS, Caveat, Caveats
 from tests.tui.service.bench_files import HOURLY, START, Place
 from tui.commands.main import app
 from tui.commands.runs import PAGE
@@ -75,7 +76,7 @@ def test_runs_that_have_begun_and_their_recordings_are_known(store: RunStore) ->
 def test_noise_is_read_by_time(store: RunStore) -> None:
     found = list(store.noise("lab"))
     assert [due for _, due, *_ in found] == [run_at(hour).due for hour in range(4)]
-    assert found[0] == ("lab", START, NOISE, False)
+    assert found[0] == ("lab", START, NOISE, NO_CAVEATS)
     assert [due for _, due, *_ in store.noise(since=run_at(2).due)] == [
         run_at(2).due,
         run_at(3).due,
@@ -84,17 +85,17 @@ def test_noise_is_read_by_time(store: RunStore) -> None:
 
 
 def test_simulated_runs_are_marked_and_earlier_versions_kept_no_mark(store: RunStore) -> None:
-    store.save(replace(run_at(2), simulated=True))
-    assert [run.simulated for run in store.runs("lab")] == [n == 2 for n in range(7)]
-    assert [simulated for *_, simulated in store.noise("lab")] == [n == 2 for n in range(4)]
+    store.save(replace(run_at(2), caveats=Caveats([Caveat.SIMULATED])))
+    assert [bool(run.caveats) for run in store.runs("lab")] == [n == 2 for n in range(7)]
+    assert [bool(caveats) for *_, caveats in store.noise("lab")] == [n == 2 for n in range(4)]
     store.save(run_at(2))  # again, as after a restart: the mark stays
-    assert store.runs("lab")[2].simulated
+    assert store.runs("lab")[2].caveats
     with closing(sqlite3.connect(store.path)) as database, database:
         database.execute("DROP TABLE simulated")
-    assert not any(run.simulated for run in store.runs("lab"))
+    assert not any(bool(run.caveats) for run in store.runs("lab"))
     assert not any(simulated for *_, simulated in store.noise())
-    store.save(replace(run_at(3), simulated=True))
-    assert [run.simulated for run in store.runs("lab")] == [n == 3 for n in range(7)]
+    store.save(replace(run_at(3), caveats=Caveats([Caveat.SIMULATED])))
+    assert [bool(run.caveats) for run in store.runs("lab")] == [n == 3 for n in range(7)]
 
 
 def test_questions_of_a_database_that_does_not_exist_make_none(tmp_path: Path) -> None:

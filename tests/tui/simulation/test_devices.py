@@ -18,7 +18,7 @@ from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.results.sources import sources
-from daq.transport.ports import is_simulated
+from daq.transport.ports import caveats_of
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
 from tests.waiting import limit
@@ -69,11 +69,11 @@ def test_simulated_ports_of_the_network_are_known_by_every_address() -> None:
         board, server = (each.port for each in running)
         here = server.replace("127.0.0.1", "localhost")
         ports = (board, f"{board}/2", f"{board}/a name", server, here, f"{here}/")
-        assert all(map(is_simulated, ports))
+        assert all(map(caveats_of, ports))
         elsewhere = board.replace("127.0.0.1", "192.168.0.7")
-        assert not is_simulated(elsewhere)
+        assert not caveats_of(elsewhere)
     # not all: a device of another test may have got one of the two ports since
-    assert not all(map(is_simulated, ports))
+    assert not all(map(caveats_of, ports))
 
 
 def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
@@ -89,11 +89,11 @@ def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
         clean.write_text(dump(own), encoding="utf-8")
         command = python_command("tui", "record", str(clean), "--duration", "1s", "-o", str(out))
         subprocess.run(command, check=True, capture_output=True, timeout=limit())
-        assert all(map(is_simulated, ports))
-        assert is_simulated(os.path.realpath(ports[0]))
-    assert not any(map(is_simulated, ports))
+        assert all(map(caveats_of, ports))
+        assert caveats_of(os.path.realpath(ports[0]))
+    assert not any(map(caveats_of, ports))
     with Recording.open(out) as recording:
-        assert recording.simulated
+        assert recording.caveats
         assert recording.bench is not None
         assert not recording.bench.runs_simulated
         temperatures = [sensor.temperature for sensor in recording.sensors]

@@ -321,11 +321,11 @@ def _date_axis(axes: Axes, days: NDArray[Any]) -> None:
 
 
 def _figure(answer: Answer, width: float, height: float) -> Figure:
-    """Return an empty figure, in inches; it says where sensors were simulated."""
+    """Return an empty figure, in inches; its title are the caveats."""
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    if answer.pooled.simulated:
-        figure.suptitle("Simulated sensors")
+    if answer.pooled.caveats:
+        figure.suptitle(answer.pooled.caveats.nouns().capitalize())
     return figure
 
 

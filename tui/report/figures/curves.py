@@ -176,7 +176,7 @@ def noise_plots(
         ]
         plots.append(
             Plot(
-                "Simulated sensors" if snapshot.simulated and not number else "",
+                "" if number else snapshot.caveats.nouns().capitalize(),
                 tuple(panels),
                 n_columns=max(widest, 2),
                 height=NOISE_HEIGHT,

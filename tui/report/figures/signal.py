@@ -68,7 +68,7 @@ def signal_plots(
     height = min(each * (len(view.traces) + 0.7), MOST_HEIGHT)
     alt = f"Waveforms of {len(view.traces)} channels, {title(view)}"
     draw = partial(_draw_waveforms, view)
-    recorded = "Recorded, simulated" if signal.recording.simulated else "Recorded"
+    recorded = signal.recording.caveats.after("Recorded")
     plots = [Plot(f"{recorded}, {title(view)}", (draw,), 1, height, alt, right=0.5)]
     main = [(n, trace) for n, trace in enumerate(view.traces) if not trace.is_auxiliary]
     for number, trace in main[:most_spectra]:

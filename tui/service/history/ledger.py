@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.units import decibels
+from daq.caveats import Caveat, Caveats
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.results.band_summary import CONSTANT, known_range
@@ -115,7 +116,7 @@ class SensorTest:
         Counts per unit, by channel.
     limits : sequence of (str, str, str, float or None)
         Channel, limit, verdict and margin in dB.
-    simulated : bool
+    caveats : Caveats
     """
 
     started: datetime
@@ -127,11 +128,12 @@ class SensorTest:
     temperature: float | None
     sensitivities: Mapping[str, float]
     limits: Sequence[tuple[str, str, str, float | None]]
-    simulated: bool
+    caveats: Caveats
 
     def document(self) -> dict[str, Any]:
         """Return the test for JSON."""
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        own = {each.name: getattr(self, each.name) for each in fields(self)} | self.caveats.keys
+        del own["caveats"]
         keys = ("channel", "limit", "verdict", "margin_db")
         limits = [dict(zip(keys, each, strict=True)) for each in self.limits]
         return own | {"started": utc_text(self.started), "limits": limits}
@@ -203,11 +205,11 @@ def record_test(path: Path, result: Result) -> list[Drift]:
     low, high = known_range(snapshot)[0], float(snapshot.frequency[-2])
     octaves = [each for each in OCTAVES if low <= each[0] and each[1] <= high]
     noise = [
-        (run_id, started, snapshot.simulated, *_values(each))
+        (run_id, started, bool(snapshot.caveats), *_values(each))
         for each in band_noise(result, octaves, about, [])
         if each.serial_number
     ]
-    test = run_id, path.name, "" if bench is None else bench.name, started, snapshot.simulated
+    test = run_id, path.name, "" if bench is None else bench.name, started, bool(snapshot.caveats)
     place.parent.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(place, timeout=10.0)) as ledger:
         ledger.executescript(_TABLES)
@@ -219,7 +221,7 @@ def record_test(path: Path, result: Result) -> list[Drift]:
                 ledger.executemany("INSERT INTO sensors VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 ledger.executemany(_ADD_NOISE, noise)
         found = [
-            _drift(ledger, name, serial, started, snapshot.simulated)
+            _drift(ledger, name, (serial, started, bool(snapshot.caveats)))
             for name, (_, serial) in about.items()
         ]
     return [each for each in found if each is not None]
@@ -240,14 +242,13 @@ def _values(noise: RecordedNoise) -> tuple[Any, ...]:
     return tuple(getattr(noise, name) for name in _NOISE.split(", "))
 
 
-def _drift(
-    ledger: sqlite3.Connection, sensor: str, serial: str, started: float, simulated: bool
-) -> Drift | None:
+def _drift(ledger: sqlite3.Connection, sensor: str, like: tuple[str, float, bool]) -> Drift | None:
     """Return the drift of a sensor in the band with most tests, the widest of these.
 
-    None at its first test. Simulated tests are compared with their like only.
+    None at its first test. `like` are serial number, time, and whether the test has caveats: tests
+    are compared with their like only.
     """
-    like = serial, started, simulated
+    serial, started, _ = like
     groups = ledger.execute(_GROUPS, (*like, started)).fetchone()
     if groups is None:
         return None
@@ -302,12 +303,16 @@ def sensor_tests(serial_number: str) -> list[SensorTest]:
             temperature=row[6],
             sensitivities=json.loads(row[7]),
             limits=tuple(tuple(each) for each in json.loads(row[8])),
-            simulated=bool(row[9]),
+            caveats=_caveats(row[9]),
         )
         for row in rows
     ]
-    is_simulated = all(each.simulated for each in found)
-    return [each for each in found if each.simulated is is_simulated]
+    all_have = all(each.caveats for each in found)
+    return [each for each in found if bool(each.caveats) is all_have]
+
+
+def _caveats(is_simulated: object) -> Caveats:
+    return Caveats.of({Caveat.SIMULATED: is_simulated})
 
 
 def noise_of(serial_number: str) -> list[Found]:
@@ -319,11 +324,11 @@ def noise_of(serial_number: str) -> list[Found]:
         If the ledger cannot be read.
     """
     rows = _rows(_OF_SENSOR, serial_number)
-    is_simulated = all(row[2] for row in rows)
+    all_have = all(row[2] for row in rows)
     return [
-        (bench, datetime.fromtimestamp(started, UTC), RecordedNoise.of(*values), is_simulated)
-        for bench, started, simulated, *values in rows
-        if bool(simulated) is is_simulated
+        (bench, datetime.fromtimestamp(started, UTC), RecordedNoise.of(*values), _caveats(mark))
+        for bench, started, mark, *values in rows
+        if bool(mark) is all_have
     ]
 
 

@@ -9,12 +9,12 @@ from datetime import datetime
 from functools import lru_cache
 from typing import Any
 
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.results.change_test import DECIBEL, NORMAL_95, Change, changes
 from tui.service.records.run_state import RecordedNoise, utc_text
 
-Found = tuple[str, datetime, RecordedNoise, bool]
-"""Name of the bench, time at which the run was due, the noise that the run found, and whether
-a sensor was simulated."""
+Found = tuple[str, datetime, RecordedNoise, Caveats]
+"""Name of the bench, time at which the run was due, the noise that the run found, its caveats."""
 
 SCATTER = 0.1
 """Standard deviation in dB from run to run that is no change."""
@@ -35,15 +35,15 @@ class NoiseSeries:
         By positions in `usable`.
     usable : tuple of int
         Positions of the noise that has an interval above zero: only these are tested.
-    simulated : bool
-        Whether a sensor was simulated: such runs are compared with their like only.
+    caveats : Caveats
+        Of all its runs: runs are compared with their like only.
     """
 
     noise: tuple[RecordedNoise, ...]
     runs: tuple[tuple[str, datetime], ...]
     changes: tuple[Change, ...]
     usable: tuple[int, ...]
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
 
     @property
     def last(self) -> RecordedNoise:
@@ -59,7 +59,7 @@ class NoiseSeries:
     def sensor(self) -> str:
         """Sensor and its serial number, for people."""
         name = f"{self.last.sensor} {self.last.serial_number}".strip()
-        return f"{name}, simulated" if self.simulated else name
+        return self.caveats.after(name)
 
     def due_of(self, position: int) -> datetime:
         """Return when the run at a position in `usable` was due."""
@@ -73,7 +73,7 @@ class NoiseSeries:
             "channel": last.channel,
             "model": last.model,
             "serial_number": last.serial_number,
-            "simulated": self.simulated,
+            **self.caveats.keys,
             "unit": last.unit,
             "method": last.method,
             "low_hz": last.low_hz,
@@ -112,8 +112,8 @@ def history(
 
     Parameters
     ----------
-    found : iterable of (str, datetime, RecordedNoise, bool)
-        Bench, due time and noise of runs, of any benches, and whether they were simulated.
+    found : iterable of (str, datetime, RecordedNoise, Caveats)
+        Bench, due time, noise and caveats of runs, of any benches.
     band : (float, float), optional
         In Hz; all bands that were kept, if not given.
     scatter : float
@@ -163,7 +163,7 @@ def _series(found: Sequence[Found], scatter: float, false_alarms: float) -> Nois
     # A standard deviation of zero would be beyond any measurement.
     deviations = [max(1e-6, math.hypot(_deviation(noise[n]), scatter)) for n in usable]
     found_changes = tuple(changes(levels, deviations, false_alarms=false_alarms))
-    return NoiseSeries(noise, runs, found_changes, usable, simulated=found[0][3])
+    return NoiseSeries(noise, runs, found_changes, usable, caveats=found[0][3])
 
 
 def _deviation(noise: RecordedNoise) -> float:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape
 
 from daq.bench.units import decibels
+from daq.caveats import Caveats
 from daq.results.change_test import DECIBEL, NORMAL_95
 from tui.page.table import Table
 from tui.service.history.series import FALSE_ALARMS, SCATTER, NoiseSeries
@@ -80,7 +81,7 @@ def history_table(found: Sequence[NoiseSeries]) -> Table:
     rows = (
         (
             last.serial_number or "-",
-            f"{last.sensor}, simulated" if series.simulated else last.sensor,
+            series.caveats.after(last.sensor),
             *(last.channel, f"{last.low_hz:.3g} to {last.high_hz:.3g}", last.unit),
             *(len(series.noise), _level(series.noise[0]), _level(last)),
             f"{len(series.changes)} ×" if series.changes else "no",
@@ -97,7 +98,7 @@ def tests_table(tests: Sequence[SensorTest]) -> Table:
     for each in tests:
         verdicts = Counter(verdict for _, _, verdict, _ in each.limits)
         temperature = "-" if each.temperature is None else f"{each.temperature:.1f}"
-        bench = f"{each.bench}, simulated" if each.simulated else each.bench
+        bench = each.caveats.after(each.bench)
         device = (each.sensor, each.model or "-", each.firmware or "-")
         limits = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"
         rows.append((utc_text(each.started), bench, *device, temperature, limits))
@@ -116,8 +117,8 @@ def label_lines(found: Sequence[NoiseSeries]) -> list[str]:
     same = [each for each in own if (each.low_hz, each.high_hz) == band]
     noise = [f"{each.channel} {_level(each)} dB" for each in same[:3]]
     test = f"{latest:%Y-%m-%d}, {band[0]:.3g} to {band[1]:.3g} Hz"
-    simulated = "simulated" if any(series.simulated for series in found) else ""
-    return [*filter(None, [widest.model, simulated]), test, *noise]
+    caveats = Caveats.joined(series.caveats for series in found)
+    return [*filter(None, [widest.model, caveats.after()]), test, *noise]
 
 
 def label_svg(serial_number: str, lines: Sequence[str]) -> str:

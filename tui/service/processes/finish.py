@@ -22,6 +22,7 @@ from typing import Any
 
 from daq.bench.estimate_settings import OPTIONS, table_keys
 from daq.bench.model import EstimateTable
+from daq.caveats import NO_CAVEATS, Caveat, Caveats
 from daq.errors import HuddleError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
@@ -99,7 +100,7 @@ class Outcome:
     error: str = ""
     parts: tuple[str, ...] = ()
     refused: bool = False
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
     identities: tuple[tuple[str, str, str], ...] = ()
     """File name, run id and root SHA-256 of each closed recording."""
 
@@ -119,6 +120,7 @@ class Outcome:
             )
             notes, parts = tuple(found.pop("notes")), tuple(found.pop("parts"))
             known = tuple((part, run, root) for part, run, root in found.pop("identities"))
+            found["caveats"] = Caveats(map(Caveat, found["caveats"]))
             return cls(noise=noise, notes=notes, parts=parts, identities=known, **found)
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"no outcome: {error}") from None
@@ -215,7 +217,7 @@ def _finished(request: Request, progress: Callable[[], object]) -> Outcome:
         except (HuddleError, OSError) as error:
             notes.append(f"no report: {error}")
             refused |= is_of_disk(error)
-    return Outcome(verdict, tuple(notes), noise, refused=refused, simulated=snapshot.simulated)
+    return Outcome(verdict, tuple(notes), noise, refused=refused, caveats=snapshot.caveats)
 
 
 def is_of_disk(error: BaseException | None) -> bool:

@@ -22,6 +22,7 @@ from enum import StrEnum
 from typing import Any
 
 from daq.bench.end_condition import NEVER, EndCondition
+from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import HuddleError
 
 RUN = "service_run"
@@ -119,8 +120,8 @@ class Run:
         When its files were removed.
     pending_hooks : tuple of str
         Hooks that have not been carried out.
-    simulated : bool
-        Whether a sensor was simulated; earlier versions did not keep it.
+    caveats : Caveats
+        Earlier versions did not keep them.
     """
 
     bench: str
@@ -139,7 +140,7 @@ class Run:
     pinned: bool = False
     removed: datetime | None = None
     pending_hooks: tuple[str, ...] = ()
-    simulated: bool = False
+    caveats: Caveats = NO_CAVEATS
     noise: tuple[RecordedNoise, ...] = field(default=(), compare=False)
 
     @property
@@ -226,7 +227,7 @@ class Run:
             "target_cov": self.until.cov,
             "until": self.until.text or None,
             "recordings": list(self.parts),
-            "simulated": self.simulated,
+            **self.caveats.keys,
             "pinned": self.pinned,
             "removed": utc_text(self.removed),
         }

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.bench.end_condition import EndCondition
+from daq.caveats import Caveat, Caveats
 from daq.errors import HuddleError
 from daq.whole_file import create_private, hidden, put_in_place, remove, replaced
 from tui.service.records.run_state import (
@@ -56,11 +57,10 @@ CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
 _INDEXES = """
 CREATE TABLE IF NOT EXISTS identities (
     part TEXT PRIMARY KEY, run TEXT NOT NULL, run_id TEXT NOT NULL, root_sha256 TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS simulated (run TEXT PRIMARY KEY);
 CREATE INDEX IF NOT EXISTS runs_by_time ON runs (due, entry);
 CREATE INDEX IF NOT EXISTS runs_by_state ON runs (bench, state, due);
 CREATE INDEX IF NOT EXISTS runs_pending ON runs (bench) WHERE untold != '[]';
-"""
+""" + "".join(f"CREATE TABLE IF NOT EXISTS {each} (run TEXT PRIMARY KEY);" for each in Caveat)
 """Made by whoever writes: with another version, earlier programs would refuse the database."""
 _COLUMNS = (
     *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
@@ -126,8 +126,8 @@ class RunStore:
                 f" ON CONFLICT (key) DO UPDATE SET {updates}",
                 row,
             )
-            if run.simulated:
-                database.execute("INSERT OR IGNORE INTO simulated VALUES (?)", (run.key,))
+            for each in run.caveats:
+                database.execute(f"INSERT OR IGNORE INTO {each} VALUES (?)", (run.key,))  # noqa: S608
             if run.noise:
                 database.execute("DELETE FROM noise WHERE run = ?", (run.key,))
                 database.executemany(
@@ -176,10 +176,12 @@ class RunStore:
         return bool(self._rows("SELECT 1 FROM sqlite_master WHERE name = ?", table))
 
     @property
-    def _is_simulated(self) -> str:
-        """The question whether a run was simulated."""
-        is_kept = self._has("simulated")
-        return "EXISTS (SELECT 1 FROM simulated WHERE run = runs.key)" if is_kept else "0"
+    def _caveats(self) -> str:
+        """The questions whether a run has each caveat."""
+        return ", ".join(
+            f"EXISTS (SELECT 1 FROM {each} WHERE run = runs.key)" if self._has(each) else "0"  # noqa: S608
+            for each in Caveat
+        )
 
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
@@ -257,8 +259,8 @@ class RunStore:
 
     def noise(
         self, bench: str | None = None, since: datetime | None = None
-    ) -> Iterator[tuple[str, datetime, RecordedNoise, bool]]:
-        """Yield the noise of all runs by their time: bench, due time, noise, whether simulated."""
+    ) -> Iterator[tuple[str, datetime, RecordedNoise, Caveats]]:
+        """Yield the noise of all runs by their time: bench, due time, noise, caveats."""
         conditions, values = [], []
         if bench is not None:
             conditions.append("bench = ?")
@@ -269,17 +271,18 @@ class RunStore:
         where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
         columns = ", ".join(f"noise.{name}" for name in _NOISE)
         rows = self._rows(
-            f"SELECT bench, due, {self._is_simulated}, {columns}"  # noqa: S608 - our own words
+            f"SELECT bench, due, {self._caveats}, {columns}"  # noqa: S608 - our own words
             " FROM runs CROSS JOIN noise ON noise.run = runs.key"
             f"{where} ORDER BY due, entry, noise.rowid",
             *values,
         )
         moments: dict[str, datetime] = {}
-        for name, due, simulated, *values_of_row in rows:
+        for name, due, *row in rows:
             moment = moments.get(due)
             if moment is None:
                 moment = moments[due] = datetime.fromisoformat(due)
-            yield name, moment, RecordedNoise.of(*values_of_row), bool(simulated)
+            caveats = Caveats.of(dict(zip(Caveat, row, strict=False)))
+            yield name, moment, RecordedNoise.of(*row[len(Caveat) :]), caveats
 
     def _found(
         self,
@@ -299,14 +302,14 @@ class RunStore:
         condition = f" WHERE {' AND '.join(where)}" if where else ""
         order = "due, entry" if last is None else f"due DESC, entry DESC LIMIT {last:d}"
         rows = self._rows(
-            f"SELECT {', '.join(_COLUMNS)}, {self._is_simulated}"  # noqa: S608 - our own words
+            f"SELECT {', '.join(_COLUMNS)}, {self._caveats}"  # noqa: S608 - our own words
             f" FROM runs{condition} ORDER BY {order}",
             *values,
         )
         if last is not None:
             rows.reverse()
         try:
-            columns = (*_COLUMNS, "simulated")
+            columns = (*_COLUMNS, *Caveat)
             return [_run(dict(zip(columns, row, strict=True))) for row in rows]
         except (TypeError, ValueError) as error:
             raise StoreError(
@@ -547,7 +550,7 @@ def _run(row: dict[str, Any]) -> Run:
         pinned=bool(row["pinned"]),
         removed=from_text(row["removed"]),
         pending_hooks=tuple(json.loads(row["untold"])),
-        simulated=bool(row["simulated"]),
+        caveats=Caveats.of(row),
     )
 
 
