@@ -156,7 +156,8 @@ class Schemas:
     def _keys(self, kind: type[Any]) -> Iterator[tuple[str, Schema, bool]]:
         if is_typeddict(kind):
             for key, hint in get_type_hints(kind, include_extras=True).items():
-                yield key, self.of(hint), get_origin(hint) is not NotRequired
+                is_always = key in kind.__required_keys__ and get_origin(hint) is not NotRequired
+                yield key, self.of(hint), is_always
             return
         about = attributes(kind)
         named = ((each.name, json_key(each)) for each in fields(kind))

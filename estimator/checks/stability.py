@@ -199,21 +199,21 @@ class Stability:
         tells of any.
     """
 
-    low: FloatArray
-    high: FloatArray
+    low: FloatArray = field(metadata={"key": "low_hz"})
+    high: FloatArray = field(metadata={"key": "high_hz"})
     parts: Scatter
     runs: Scatter | None
-    inflations: FloatArray
-    changes: tuple[ResponseChange, ...]
-    added: FloatArray
-    explained: FloatArray
-    within: FloatArray
-    n_segments: int
+    inflations: FloatArray = field(metadata=NOT_IN_JSON)
+    changes: tuple[ResponseChange, ...] = field(metadata=NOT_IN_JSON)
+    added: FloatArray = field(metadata=NOT_IN_JSON)
+    explained: FloatArray = field(metadata=NOT_IN_JSON)
+    within: FloatArray = field(metadata=NOT_IN_JSON)
+    n_segments: int = field(metadata={"key": "segments"})
     disturbed: IntArray
-    excess: float
+    excess: float = field(metadata={"key": "excess_share"})
     channel: int
-    is_restless: bool = False
-    steadied: tuple[Steadied | None, ...] = ()
+    is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
+    steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
 
     @property
     def inflation(self) -> float:

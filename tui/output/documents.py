@@ -25,7 +25,7 @@ from estimator.checks.advice import Rank, Untested
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.sensitivities import Cause
-from estimator.checks.stability import Scatter
+from estimator.checks.stability import Stability
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.likelihood.dimension import BandDimension
 from estimator.spectra.segment_rejection import Reason
@@ -170,20 +170,10 @@ class SynchronisationDocument(TypedDict):
     removed_psd: NotRequired[Annotated[Table | None, "What they take away at most, in unit²/Hz."]]
 
 
-class StabilityDocument(TypedDict):
-    """Whether the noise changes."""
+class StabilityKeys(TypedDict):
+    """What JSON says of stability beside its fields."""
 
-    low_hz: Annotated[Row, "First frequency of each band."]
-    high_hz: Annotated[Row, "Last frequency of each band."]
-    parts: Annotated[Scatter, "Scatter between parts of equal length."]
-    runs: Annotated[Scatter | None, "Scatter between recordings; null for one recording."]
     inflation: Annotated[float, "Variance over that of steady noise."]
-    segments: Annotated[int, "Number of examined segments."]
-    disturbed: Annotated[Annotated[IntArray, 1], "Disturbed segments."]
-    excess_share: Annotated[
-        float, "Noise that these segments add, as a fraction, for the worst band and channel."
-    ]
-    channel: Annotated[int, "That channel, from 0."]
 
 
 class ClockKeys(TypedDict):
@@ -196,7 +186,29 @@ class ClockKeys(TypedDict):
     restarts: Annotated[int, "Number of restarts."]
 
 
-class DiagnosticsDocument(TypedDict):
+class DiagnosticsBesides(TypedDict, total=False):
+    """Keys that are absent where the data are insufficient or no channel is affected."""
+
+    edge_leakage: Annotated[EdgeLeakage, "Leakage at the edges of segments."]
+    dimensions: Annotated[tuple[BandDimension, ...], "Dimensions of the motion, by band."]
+    tested_dimensions: Annotated[int, "Dimensions of the motion in the model that was tested."]
+    bands: Annotated[tuple[BandDiagnosis, ...], "The diagnosis by band."]
+    responses: Annotated[tuple[RelativeResponse, ...], "Response of sensors relative to others."]
+    shared_noise_searched: Annotated[bool, "False with too many channels."]
+    stability: Annotated[Annotated[Stability, StabilityKeys] | None, "Whether the noise changes."]
+    pairs: Annotated[list[tuple[str, str]], "Names of each pair of sensors."]
+    per_frequency: Annotated[FrequencyDiagnosis, "The diagnosis by frequency."]
+    clipped_share: Annotated[Mapping[str, float], "Share of clipped samples, by affected channel."]
+    repeated_share: Annotated[
+        Mapping[str, float], "Share of repeated samples, by affected channel."
+    ]
+    wraps_at_bits: Annotated[Mapping[str, int], "Bits at which counts wrap, by affected channel."]
+    stood_still_s: Annotated[
+        Mapping[str, float], "Seconds with a constant count, by affected channel."
+    ]
+
+
+class DiagnosticsDocument(DiagnosticsBesides):
     """What the samples show of the test; see docs/json.md."""
 
     start_utc_ns: Annotated[Signed, "UTC of the first sample, in ns since 1970."]
@@ -221,33 +233,6 @@ class DiagnosticsDocument(TypedDict):
     ]
     synchronisation: Annotated[SynchronisationDocument, "What is left between the clocks."]
     untested: Annotated[Untested | None, "Why the model of one common motion was not tested."]
-    edge_leakage: NotRequired[Annotated[EdgeLeakage, "Leakage at the edges of segments."]]
-    dimensions: NotRequired[
-        Annotated[tuple[BandDimension, ...], "Dimensions of the motion, by band."]
-    ]
-    tested_dimensions: NotRequired[
-        Annotated[int, "Dimensions of the motion in the model that was tested."]
-    ]
-    bands: NotRequired[Annotated[tuple[BandDiagnosis, ...], "The diagnosis by band."]]
-    responses: NotRequired[
-        Annotated[tuple[RelativeResponse, ...], "Response of sensors relative to others."]
-    ]
-    shared_noise_searched: NotRequired[Annotated[bool, "False with too many channels."]]
-    stability: NotRequired[Annotated[StabilityDocument | None, "Whether the noise changes."]]
-    pairs: NotRequired[Annotated[list[tuple[str, str]], "Names of each pair of sensors."]]
-    per_frequency: NotRequired[Annotated[FrequencyDiagnosis, "The diagnosis by frequency."]]
-    clipped_share: NotRequired[
-        Annotated[Mapping[str, float], "Share of clipped samples, by affected channel."]
-    ]
-    repeated_share: NotRequired[
-        Annotated[Mapping[str, float], "Share of repeated samples, by affected channel."]
-    ]
-    wraps_at_bits: NotRequired[
-        Annotated[Mapping[str, int], "Bits at which counts wrap, by affected channel."]
-    ]
-    stood_still_s: NotRequired[
-        Annotated[Mapping[str, float], "Seconds with a constant count, by affected channel."]
-    ]
 
 
 class EstimateDocument(TypedDict):

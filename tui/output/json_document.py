@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
-    from estimator.checks.stability import Stability
     from tui.output.documents import (
         BandMeanDocument,
         CaveatsDocument,
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
         FactDocument,
         FindingDocument,
         RecordingDocument,
-        StabilityDocument,
         SynchronisationDocument,
         VerdictDocument,
     )
@@ -438,7 +436,9 @@ def diagnostics_document(snapshot: Snapshot) -> DiagnosticsDocument:
             "bands": found.diagnosis.bands,
             "responses": found.diagnosis.responses,
             "shared_noise_searched": len(snapshot.channels) <= MAX_CHANNELS,
-            "stability": None if stability is None else _stability(stability),
+            "stability": None
+            if stability is None
+            else plain(stability) | {"inflation": stability.inflation},
             "pairs": [(sensors[one], sensors[two]) for one, two in found.diagnosis.pairs],
             "per_frequency": found.diagnosis.per_frequency,
         }
@@ -462,17 +462,3 @@ def _synchronisation(found: Synchronisation) -> SynchronisationDocument:
     if found.noise_bias is not None:
         document |= {"noise_bias_share": found.noise_bias, "removed_psd": found.removed}
     return document
-
-
-def _stability(found: Stability) -> StabilityDocument:
-    return {
-        "low_hz": found.low,
-        "high_hz": found.high,
-        "parts": found.parts,
-        "runs": found.runs,
-        "inflation": found.inflation,
-        "segments": found.n_segments,
-        "disturbed": found.disturbed,
-        "excess_share": found.excess,
-        "channel": found.channel,
-    }
