@@ -130,7 +130,7 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
         "history": f"estimated by huddle-bench {__version__}",
         "confidence_of_intervals": "0.95",
         "unit_of_densities": f"({snapshot.unit})²/Hz",
-        "verdict": "none" if result.verdict is None else result.verdict.verdict,
+        "verdict": "none" if result.verdict is None else result.verdict.verdict.value,
         "facts": json_text(facts_document(result.all_facts)),
         **{key: str(holds).lower() for key, holds in snapshot.caveats.keys.items()},
         "flags": json.dumps({str(flag.name).lower(): int(flag) for flag in Flag}),

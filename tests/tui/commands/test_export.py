@@ -33,6 +33,7 @@ from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
+from tests.tui import night_recording
 from tui.commands.main import app
 from tui.notebook.curve_files import WRITERS
 from tui.output.exit_codes import ExitCode
@@ -448,6 +449,18 @@ def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: s
     assert said["simulated"] == "false"
     assert json.loads(said["flags"])["dead_channel"] == 4
     assert run(recording, "--format", kind, "-o", path).exit_code == ExitCode.DONE  # replaced
+
+
+@pytest.mark.usefixtures("zarr_threads")
+@pytest.mark.parametrize("kind", READ_TWICE)
+def test_exports_of_a_bench_with_limits_say_the_verdict(tmp_path: Path, kind: str) -> None:
+    """A value of an enumeration is no text to h5netcdf."""
+    if kind == "parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
+    night, path = night_recording.record(tmp_path / "night.h5"), tmp_path / "night.out"
+    found = run(night, "--format", kind, "-o", path)
+    assert found.exit_code == ExitCode.DONE, found.output
+    assert said_by_file(tmp_path, kind, path)["verdict"] == "not-decided"
 
 
 @pytest.fixture(scope="module")
