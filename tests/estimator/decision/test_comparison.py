@@ -56,6 +56,14 @@ def test_all_of_an_interval_decides(
     assert judged.band in {2, 0} if obstacle is Obstacle.NO_ESTIMATE else judged.band is not None
 
 
+@pytest.mark.parametrize("gains", [(0.9, 1.1), (1.1,)])
+def test_what_the_sensitivity_may_be_must_not_change_the_verdict(gains: tuple[float, ...]) -> None:
+    for ends, verdict in (((0.2, 0.7), Verdict.PASS), ((1.3, 2.0), Verdict.FAIL)):
+        assert comparison(*ends, gains=gains).judged().verdict is verdict
+    judged = comparison(1.1, 2.0, gains=gains).judged()  # 1.1 / 1.1**2 is below the mask
+    assert (judged.verdict, judged.obstacle) == (Verdict.NOT_DECIDED, Obstacle.SENSITIVITY)
+
+
 def test_few_averages_and_channels_without_partners_decide_nothing() -> None:
     few = comparison(1.1, 2.0, averages=np.full(3, 19.0)).judged()
     assert few.obstacle is Obstacle.TOO_FEW_AVERAGES
