@@ -13,7 +13,7 @@ from daq.bench.end_condition import EndCondition
 from daq.recording.monitor import RecordingMonitor, SensorStatus
 from daq.recording.reader import Recording
 from tests.daq.recording.sending_bench import Bench
-from tests.tui.example_snapshot import growing
+from tests.tui.example_snapshot import growing, made_now
 
 
 @contextmanager
@@ -128,3 +128,12 @@ def test_channels_at_the_end_of_their_range_and_without_signal(tmp_path: Path) -
         seen = look()
         assert (seen["A"].is_clipping, seen["A"].n_clipped) == (False, 2)
         assert (seen["C"].stuck, seen["C"].was_stuck) == ((), ("Y",))
+
+
+def test_a_moment_to_come_is_counted_from_what_was_recorded() -> None:
+    now = made_now(elapsed=100.0)
+    moment = now.in_local_time(20.0)
+    assert moment is not None
+    assert moment.timestamp() == pytest.approx(now.started_utc_ns * 1e-9 + 120.0)
+    assert now.in_local_time(None) is None
+    assert replace(now, speed=8.0).in_local_time(20.0) is None  # it is not in real time
