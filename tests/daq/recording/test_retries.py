@@ -8,7 +8,9 @@ from daq.recording.storage.retries import PAUSES, repeated
 
 
 @pytest.mark.parametrize("n_failures", [0, 1, len(PAUSES)])
-def test_a_write_is_repeated_until_it_succeeds(n_failures: int) -> None:
+def test_a_write_is_repeated_until_it_succeeds(
+    n_failures: int, caplog: pytest.LogCaptureFixture
+) -> None:
     calls: list[str] = []
 
     def write() -> None:
@@ -20,6 +22,8 @@ def test_a_write_is_repeated_until_it_succeeds(n_failures: int) -> None:
     repeated(write, before=lambda: calls.append("before"), sleep=slept.append)
     assert calls == ["write"] + ["before", "write"] * n_failures
     assert slept == list(PAUSES[:n_failures])
+    said = "a write to the recording failed and is repeated: No space left on device"
+    assert caplog.messages == [said] * n_failures
 
 
 def test_a_persistent_error_is_raised() -> None:
