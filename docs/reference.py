@@ -161,7 +161,9 @@ def _keys(schema: dict[str, Any], before: str) -> Iterator[tuple[str, str]]:
     for key, part in schema.get("properties", {}).items():
         links = re.findall(r'"#/\$defs/(\w+)"', json.dumps(part))
         link = "".join(f" See `{each}`." for each in dict.fromkeys(links))
-        yield before + key, plain_text(part.get("description", "") + link).replace("|", "\\|")
+        enum = ", ".join(f"`{each}`" for each in part.get("enum", ()) if each is not None)
+        text = plain_text(part.get("description", "") + link + (f" One of {enum}." if enum else ""))
+        yield before + key, text.replace("|", "\\|")
         for option in (part, *part.get("anyOf", ()), *part.get("oneOf", ())):
             for inner in (option, option.get("items", {})):
                 yield from _keys(inner, f"{before}{key}.")

@@ -88,7 +88,9 @@ class Schemas:
             return {"enum": [each.value for each in list[Enum](kind)]}
         name = re.sub(r"(?<=.)([A-Z])", r"_\1", kind.__name__.removesuffix("Document")).lower()
         if kind not in self.places:
-            self.places[kind] = f"#/$defs/{name}"
+            if name in self.definitions:
+                raise ValueError(f"two classes would be {name}, one of them {kind}")
+            self.places[kind], self.definitions[name] = f"#/$defs/{name}", {}
             self.definitions[name] = self.object(kind)
         return {"$ref": self.places[kind]}
 

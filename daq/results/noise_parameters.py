@@ -66,8 +66,12 @@ class SheetComparison:
         Band in which it was measured.
     unit : str
         Of the values.
-    stated, measured, low, high : float
-        Of the data sheet, of the estimate, and its 95 % interval.
+    stated : float
+        Of the data sheet.
+    measured : float
+        Of the estimate.
+    low, high : float
+        Its 95 % interval.
     outcome : SheetOutcome
     """
 

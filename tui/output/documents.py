@@ -20,6 +20,7 @@ from daq.estimation.noise_estimates import ALL_METHODS
 from daq.estimation.snapshot import Bridged, Octave, SensorTotals
 from daq.estimation.snapshot_diagnostics import EdgeLeakage, FrequencyDiagnosis
 from daq.results.decision.verdict import LimitResult
+from daq.results.noise_parameters import SheetComparison
 from daq.results.sources import LoggedEvent
 from estimator.checks.advice import Rank, Untested
 from estimator.checks.band import BandDiagnosis
@@ -28,6 +29,8 @@ from estimator.checks.sensitivities import Cause
 from estimator.checks.stability import Stability
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.likelihood.dimension import BandDimension
+from estimator.noise_parameters.allan import AllanDeviation
+from estimator.noise_parameters.fit import NoiseParameters
 from estimator.spectra.segment_rejection import Reason
 from estimator.types import FloatArray, IntArray
 
@@ -385,12 +388,34 @@ class BandMeanDocument(TypedDict):
     ]
 
 
-class NoiseParametersDocument(TypedDict):
-    """Noise terms of one channel; see docs/json.md."""
+class TermDocument(TypedDict):
+    """One noise term; one that is absent is around zero, possibly negative."""
+
+    value: Annotated[float, "One-sided PSD at 1 Hz."]
+    error: Annotated[float, "Its standard error."]
+
+
+class ChannelNoiseDocument(TypedDict):
+    """Noise terms of one channel, by the first method."""
 
     sensor: Annotated[str, "Name of the sensor."]
     channel: Annotated[str, "Name of the channel."]
     unit: Annotated[str, "Unit of the motion."]
+    terms: Annotated[
+        Mapping[str, TermDocument] | None,
+        "By name: random-walk (f⁻²), flicker (f⁻¹), white, f-squared (f²).",
+    ]
+    covariance: Annotated[Table | None, "Of the four values, in this order."]
+    fit: Annotated[NoiseParameters | None, "How the terms describe the noise."]
+    refused: Annotated[str | None, "Why there are no terms."]
+    allan_deviation: Annotated[AllanDeviation | None, "Allan deviation against averaging time."]
+    quantisation_psd: Annotated[
+        float,
+        "Mean quantisation noise, LSB²/(6 × sampling rate); null where samples are not whole "
+        "numbers.",
+    ]
+    quantisation_share: Annotated[float, "Its share of the noise."]
+    data_sheet: Annotated[tuple[SheetComparison, ...], "Values of the data sheet."]
 
 
 class WholeDocument(VerdictDocument):
@@ -420,7 +445,7 @@ class WholeDocument(VerdictDocument):
     ]
     noise_parameters: NotRequired[
         Annotated[
-            list[NoiseParametersDocument],
+            list[ChannelNoiseDocument],
             "With --noise-parameters: noise terms of every channel.",
         ]
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from daq.estimation.snapshot import ChannelLabel
     from estimator.noise_parameters.allan import AllanDeviation
+    from tui.output.documents import ChannelNoiseDocument
 
 MISFIT = 5.0
 """Standard errors from which on it is said that the terms do not describe the noise."""
@@ -166,7 +167,9 @@ def quantisation_notes(
     return [line]
 
 
-def noise_parameters_document(found: Sequence[ChannelParameters]) -> list[dict[str, Any]]:
+def noise_parameters_document(
+    found: Sequence[ChannelParameters],
+) -> list[ChannelNoiseDocument]:
     """Return the noise parameters of every channel as JSON values."""
     return [
         {

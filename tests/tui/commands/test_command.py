@@ -408,7 +408,7 @@ def test_noise_parameters_on_request(tmp_path: Path) -> None:
     white = first["terms"]["white"]
     assert abs(white["value"] - 0.01 / 50) < 4 * white["error"]
     assert len(first["allan_deviation"]["tau"]) == len(first["allan_deviation"]["deviation"])
-    documented = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    documented = reference.result()
     assert not [key for key in first if f"`{key}`" not in documented]
 
 
