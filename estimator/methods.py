@@ -51,6 +51,7 @@ def self_noise(
     correlation: FloatArray | None = None,
     groups: IntArray | None = None,
     known: SelfNoise | None = None,
+    inflation: FloatArray | float = 1.0,
     **options: Any,  # noqa: ANN401 - each method's own
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel by a named method.
@@ -82,6 +83,8 @@ def self_noise(
         Group of every sensor: sensors of one group may share noise. Default: none do.
     known : SelfNoise, optional
         What the method gives without `blocks`, if that is estimated already.
+    inflation : float64, shape (n_freqs,), or float
+        Variance of the averages over that of steady noise, by which those of `blocks` are fewer.
     **options
         Options of the method.
 
@@ -141,6 +144,7 @@ def self_noise(
                 n_effective=n_effective,
                 correct=correct,
                 correlation=np.ones(1) if correlation is None else correlation,
+                inflation=np.broadcast_to(inflation, (len(csm),)),
             )
     if last:
         options["where"] = ~np.isfinite(found.noise_psd).all(axis=1)
@@ -213,6 +217,7 @@ def _with_neighbours(
     n_effective: float,
     correct: bool,
     correlation: FloatArray,
+    inflation: FloatArray,
 ) -> SelfNoise:
     """Return a result with the levels of the engine, `estimator.levels.pooled`.
 
@@ -264,6 +269,7 @@ def _with_neighbours(
         dims=live,
         n_effective=n_effective,
         correlation=correlation,
+        inflation=inflation[rows],
     )
     known = np.isfinite(pooled.noise).all(axis=1)
     here = rows[known]

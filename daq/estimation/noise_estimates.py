@@ -526,6 +526,7 @@ def noise_estimates(
     maxima: Maxima | None = None,
     shared: Sequence[tuple[int, int]] = (),
     chosen: bool = False,
+    stability: Stability | None = None,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -549,6 +550,8 @@ def noise_estimates(
     chosen : bool
         Whether the methods replace `auto`, so that all levels are those of the engine; by name,
         three-sensor is the paper's formula.
+    stability : Stability, optional
+        Of these averages: where noise changes, fewer averages tell it from motion.
     """
     chosen, known = chosen or "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
@@ -592,6 +595,9 @@ def noise_estimates(
                         blocks=blocks_of(band.frequencies) if engine else None,
                         correlation=_power_correlation(band),
                         known=before,
+                        inflation=1.0
+                        if stability is None
+                        else stability.inflation_at(band.frequencies),
                         **option,
                     )
                     for band, option, before in zip(bands, options, given, strict=True)

@@ -228,6 +228,7 @@ class SnapshotBuilder:
         self._outgrown: Callable[[], Dimensions] | None = None
         self._choice = _Beside()
         self._findings = Findings()
+        self._stability_known = self._findings.stability
         self._diagnoses = Throttle(diagnosis_share)
         self._choices = Throttle(1.0)  # limited by `_RECHOICE`
         self._occasional_cost = 0.0
@@ -380,10 +381,13 @@ class SnapshotBuilder:
         *,
         maxima: Maxima,
     ) -> Estimates:
-        """Return estimates without dimensions of the motion that are noise which changes."""
-        before = estimates.dimensions
-        self._dimensions = beside_changing_noise(before, bands, self._findings.stability)
-        if self._dimensions is before:
+        """Return estimates of noise that is found to change, without dimensions that are noise."""
+        steady = self._findings.stability
+        self._dimensions = beside_changing_noise(estimates.dimensions, bands, steady)
+        changes = (
+            steady is not None and steady.inflation > 1 and steady is not self._stability_known
+        )
+        if self._dimensions is estimates.dimensions and not changes:
             return estimates
         n = bands[-1].n_segments
         return self._estimates(bands, raw, recording, first, n, maxima=maxima, final=False)
@@ -499,6 +503,7 @@ class SnapshotBuilder:
         if self._choice.is_made:
             self._dimensions, self._chosen_at = self._choice.taken(self._dimensions), self._grown_to
         keep = not final and self._fits(bands)
+        self._stability_known = self._findings.stability
         with self._choices:
             estimates = noise_estimates(
                 bands,
@@ -510,6 +515,7 @@ class SnapshotBuilder:
                 known=self._known(bands, raw),
                 maxima=maxima,
                 shared=self._pairs,
+                stability=self._stability_known,
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments

@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import field, replace
 from itertools import combinations
 
@@ -35,9 +35,9 @@ from estimator.checks.steadiness import (
     variance_of_changes,
 )
 from estimator.likelihood import fisher
-from estimator.likelihood.factor_analysis import Maximum
+from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import critical_value
-from estimator.likelihood.score_test import usable
+from estimator.likelihood.score_test import are_resolved, usable
 from estimator.median import median
 from estimator.records import NOT_IN_JSON, dataclass
 from estimator.spectra.parts import Parts, grouped
@@ -79,6 +79,11 @@ LEAST_SHARE = 0.01
 """Share of a channel beside the motion, from which what its regression explains counts."""
 ADDED = 0.05
 """Share of the noise that changes of responses add, from which a band shows them."""
+BEYOND_GUSTS = 5.0
+"""Motion and noise over noise, to which noise that changes does not come by scatter."""
+LEAST_USABLE = 0.5
+"""Share of the frequencies of a band that show the directions of the motion: with fewer, their mean
+does."""
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
@@ -348,16 +353,15 @@ def stability(
     Stability or None
         None with too few parts or frequencies.
     """
-    good, places = usable(maximum, n_effective), np.flatnonzero(parts.bins < len(frequency))
-    doubtful = bool(good[parts.bins[places]].sum() < FREQUENCIES)
-    if doubtful:  # the noise of a sensor may seem to be zero where all others change
-        good = maximum.converged & ~maximum.singular
-        good &= maximum.eigenvalues[:, maximum.n_factors - 1] > STRONG
-    places = places[good[parts.bins[places]]]
+    places = np.flatnonzero(parts.bins < len(frequency))
+    good, doubtful = _tested(maximum, parts.bins[places], n_effective)
+    known = ~maximum.singular
+    known[[0, -1]] = False  # real
+    every, places = (places[each[parts.bins[places]]] for each in (known, good))
     averages = parts.averages
     q = maximum.n_factors
     groups = grouped(averages, q + max(MIN_DEGREES, maximum.psi.shape[1]))
-    if len(groups) < MIN_PARTS or len(places) < FREQUENCIES:
+    if len(groups) < MIN_PARTS:
         return None
     runs = np.array([each.run for each in parts.each])
     by_run = [np.flatnonzero(runs == run) for run in sorted(set(runs.tolist()))]
@@ -366,21 +370,23 @@ def stability(
     begin = np.array([parts.each[some[0]].begin for some in groups])
     end = np.array([parts.each[some[-1]].end for some in groups])
     correlation = np.concatenate([[1.0], neighbours, [0.0]])
+    of_band = functools.partial(
+        _band,
+        parts,
+        psd=psd,
+        groups=groups,
+        by_run=by_run if several else [],
+        correlation=correlation,
+        dims=dims,
+    )
     bands = []
     for inside in insides:
-        some = places[inside[parts.bins[places]]]
-        bands.append(
-            _band(
-                parts,
-                maximum,
-                psd,
-                some,
-                groups=groups,
-                by_run=by_run if several else [],
-                correlation=correlation,
-                dims=dims,
-            )
-        )
+        some, whole = (each[inside[parts.bins[each]]] for each in (places, every))
+        if doubtful or _is_beyond_gusts(maximum.take(parts.bins[whole])):
+            bands.append(of_band(maximum, some))
+        else:
+            at = parts, whole
+            bands.append(_of_weak_motion(of_band, at, maximum, psd=psd, n_effective=n_effective))
     found = [band for band in bands if band is not None]
     if doubtful:
         bands = [None if band is None else replace(band, levels=None) for band in bands]
@@ -443,10 +449,23 @@ def stability(
     )
 
 
+def _tested(maximum: Maximum, bins: IntArray, n_effective: float) -> tuple[BoolArray, bool]:
+    """Return where residuals are tested, shape (n_freqs,), and whether their noise is in doubt."""
+    good, strong = usable(maximum, n_effective), maximum.converged & ~maximum.singular
+    # the noise of a sensor may seem to be zero where all others change
+    strong &= maximum.eigenvalues[:, maximum.n_factors - 1] > STRONG
+    few, some = good[bins].sum() < FREQUENCIES, strong[bins].sum() >= FREQUENCIES
+    return (strong, True) if few and some else (good, False)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Band:
-    """What the parts show of one band; `levels` are None where they are too uncertain."""
+    """What the parts show of one band; `levels` are None where they are too uncertain.
 
+    `worth` is the number of its frequencies that are independent.
+    """
+
+    worth: float
     explained: _Explained
     levels: PartLevels | None
     of_runs: PartLevels | None
@@ -485,21 +504,70 @@ class _Band:
         return replace(self, levels=levels, scores=self.scores.of_parts(some))
 
 
+def _is_beyond_gusts(maximum: Maximum) -> bool:
+    """Return whether the motion of a band is stronger than noise that changes ever seems."""
+    last = maximum.eigenvalues[:, maximum.n_factors - 1 : maximum.n_factors]
+    return not len(last) or bool(median(np.ravel(last)) > BEYOND_GUSTS)
+
+
+def _of_weak_motion(
+    of_band: Callable[..., _Band | None],
+    at: tuple[Parts, IntArray],
+    maximum: Maximum,
+    *,
+    psd: FloatArray,
+    n_effective: float,
+) -> _Band | None:
+    """Return what the parts show of a band whose noise may look like motion where it changes.
+
+    If few frequencies show directions of the motion beside that, these are those of their mean, as
+    many as it shows. None where it shows motion that a fit does not explain.
+    """
+    parts, places = at
+    bins = parts.bins[places]
+    if len(places) < FREQUENCIES // 2 or (psd[bins] <= 0).any():
+        return None
+    (whole,) = parts.joined(places, [np.arange(len(parts.each))]).csm
+    root = np.sqrt(psd[bins])
+    mean = (whole / root[:, :, None] / root[:, None, :]).mean(axis=0, keepdims=True)
+    still = of_band(maximise(mean, 0), places, is_weak=True)
+    if still is None:
+        return None
+    averages = n_effective / still.inflation
+    some = places[usable(maximum, averages)[bins]]
+    if len(some) >= LEAST_USABLE * len(places):
+        return of_band(maximum, some)
+    averages *= still.worth
+    for q in range(maximum.n_factors, -1, -1):
+        found = maximise(mean, q)
+        if usable(found, averages)[0]:
+            further = np.asarray(np.linalg.eigvalsh(found.rest)[:, -1], np.float64)
+            if are_resolved(further, mean.shape[1], averages)[0]:
+                return None
+            return of_band(found, places, is_weak=True) if q else still
+    return None
+
+
 def _band(
     parts: Parts,
     maximum: Maximum,
-    psd: FloatArray,
     places: IntArray,
     *,
+    psd: FloatArray,
+    is_weak: bool = False,
     groups: Sequence[IntArray],
     by_run: Sequence[IntArray],
     correlation: FloatArray,
     dims: tuple[int, ...],
 ) -> _Band | None:
-    """Return what the parts show at some of their frequencies; None where that is too little."""
+    """Return what the parts show at some of their frequencies; None where that is too little.
+
+    Weak motion shows no response.
+    """
     if not len(places):
         return None
-    q, at_once = maximum.n_factors, max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
+    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
+    q = max(1, maximum.n_factors)
     levels, of_runs, responses = [], [], []
     scores = _Scores(len(groups), sum(dims))
     spread, beside = 0.0, np.zeros(sum(dims))
@@ -508,14 +576,15 @@ def _band(
     for some in np.array_split(places, -(-len(places) // at_once)):
         bins = parts.bins[some]
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
-        divided, at, own = parts.joined(some, groups), maximum.take(bins), correlation[lags]
+        divided, own = parts.joined(some, groups), correlation[lags]
+        at = maximum.take(np.zeros_like(bins) if is_weak else bins)
         if not np.isfinite(divided.csm).all():
             return None
         found = regression(divided, at, psd[bins])
         own_beside = np.einsum("fpp->p", found.projector).real
         level = np.einsum("kfpp->kp", found.covariance)
         motion = np.einsum("kfaa->k", found.motion).real / (found.averages + q) / (q * len(some))
-        used = motion > LEAST_MOTION * (level / own_beside).max(axis=1)
+        used = (motion > LEAST_MOTION * (level / own_beside).max(axis=1)) & (not is_weak)
         beside += own_beside / len(places)
         if used.any():
             power += found.explained(used) / len(places)
@@ -526,7 +595,8 @@ def _band(
         levels.append(piece)
         scores.add(found, own)
         each = ResponseScores(dims, len(groups))
-        each.add(found, own)
+        if not is_weak:
+            each.add(found, own)
         responses.append(each)
         if by_run:
             of_run = regression(parts.joined(some, by_run), at, psd[bins])
@@ -535,11 +605,12 @@ def _band(
     known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
     total = parts.averages.sum()
     # few averages of noise that changes look like a response, unless the motion is far stronger
-    strong = median(maximum.eigenvalues[parts.bins[places], q - 1]) > STRONG
+    strong = not is_weak and median(maximum.eigenvalues[parts.bins[places], q - 1]) > STRONG
     more = scores.inflation(whole) if known else 1.0 if strong else np.inf
     power, scatter = power.sum(axis=0) / total, more * q * noise.sum(axis=0) / total
     n_alike = noise.sum(axis=0) ** 2 / np.maximum((noise**2).sum(axis=0), np.finfo(np.float64).tiny)
     return _Band(
+        len(places) ** 2 / spread,
         _Explained(
             power=power,
             scatter=scatter,

@@ -206,6 +206,7 @@ def pooled_noise(
     dims: tuple[int, ...],
     n_effective: float,
     correlation: FloatArray,
+    inflation: FloatArray | float = 1.0,
 ) -> Pooled:
     """Estimate the noise of every bin from directions that neighbouring bins share.
 
@@ -224,6 +225,9 @@ def pooled_noise(
         Independent averages of one bin.
     correlation : float64, shape (n_lags,)
         Of averages k bins apart, 1 at k = 0.
+    inflation : float64, shape (n_freqs,), or float
+        Variance of the averages over that of steady noise: of noise that changes, as many fewer
+        averages show the motion. `cumulants` are those of steady noise.
     """
     n_freqs, p = matrix.shape[:2]
     unknown = np.full((4, n_freqs, p), np.nan)
@@ -233,6 +237,7 @@ def pooled_noise(
     table = n_effective * worth(int(sizes.max(initial=1)), correlation)
     some = np.flatnonzero(table[sizes] > 1.2 * p)
     sensor = np.repeat(np.arange(len(dims)), dims)
+    fewer = np.maximum.reduceat(np.broadcast_to(inflation, (n_freqs,)), edges[:-1])
     before = np.cumsum(sizes[some]) * matrix[:1].nbytes // _BYTES_AT_ONCE
     for group in np.split(some, np.flatnonzero(np.diff(before)) + 1):
         if len(group):
@@ -246,6 +251,7 @@ def pooled_noise(
                 most=most,
                 sensor=sensor,
                 averages=table,
+                fewer=fewer[group],
             )
     return found
 
@@ -260,16 +266,17 @@ def _pool(
     most: int,
     sensor: IntArray,
     averages: FloatArray,
+    fewer: FloatArray,
 ) -> None:
     """Write noise and cumulants of some blocks.
 
     `begin`, `sizes` and `q` are first bins, numbers of bins and dimensions of the blocks;
-    `averages` are what so many bins are worth.
+    `averages` are what so many bins are worth, over `fewer` of the block.
     """
     p, n_effective = matrix.shape[1], float(averages[1])
 
     def cut(of: IntArray, k: IntArray) -> tuple[_Parts, ComplexArray]:
-        parts = _parts(begin[of], sizes[of], k, averages)
+        parts = _parts(begin[of], sizes[of], k, averages, fewer[of])
         summed = np.add.reduceat(matrix[parts.bins], parts.start)
         return parts, np.asarray(summed / parts.count[:, None, None])
 
@@ -278,7 +285,7 @@ def _pool(
     whole = fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, most=most, resolve=False)
     level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
     as_whole = np.ones(len(at), np.bool_)
-    enough = int(np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p))) + 1
+    enough = np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p) * fewer) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either
@@ -311,7 +318,9 @@ def _pool(
     _read(found, matrix, whole, sensor, as_whole)
 
 
-def _parts(begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray) -> _Parts:
+def _parts(
+    begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray, fewer: FloatArray
+) -> _Parts:
     """Cut blocks, given by first bin and number of bins, into sub-blocks of about k bins."""
     number = np.maximum(1, sizes // np.maximum(k, 1))
     block = np.repeat(np.arange(len(sizes)), number)
@@ -327,8 +336,8 @@ def _parts(begin: IntArray, sizes: IntArray, k: IntArray, worth_of: FloatArray) 
         block=block,
         first=first,
         share=count / sizes[block],
-        averages=worth_of[count],
-        whole=worth_of[sizes],
+        averages=worth_of[count] / fewer[block],
+        whole=worth_of[sizes] / fewer,
     )
 
 

@@ -46,6 +46,25 @@ def test_intervals_cover_the_mean_noise(case: str, sensor: int, covered: float) 
     assert np.mean(hits) > covered
 
 
+@pytest.mark.parametrize("n_sensors", [3, 5])
+def test_gusts_beside_weak_motion_are_noise_that_changes(n_sensors: int) -> None:
+    """Their scatter would be taken for motion: of five sensors, 85 % held the noise."""
+    rng = np.random.default_rng(5)
+    n = round(600 * RATE)
+    motion = np.sqrt(0.2) * rng.standard_normal((n, 2))
+    level = np.exp(0.7 * rng.standard_normal(n // 200)).repeat(200)[:, None]  # of 5 s each
+    samples = {
+        name: motion @ np.linalg.qr(rng.standard_normal((2, 2)))[0]
+        + level * rng.standard_normal((n, 2))
+        for name in "ABCDE"[:n_sensors]
+    }
+    found = huddle.self_noise(samples, fs=RATE, segment="4s").snapshot
+    noise, truth = next(iter(found.results.values())), float((level**2).mean()) * 2 / RATE
+    low, high = noise.low[5:72], noise.high[5:72]
+    assert np.mean((low <= truth) & (truth <= high)) > 0.9
+    assert NoiseChanges in [type(each) for each in found.diagnostics.advice]
+
+
 @pytest.mark.long
 def test_gusts_are_no_motion_and_bound_no_level() -> None:
     """Few segments hold most of the noise: its averages are few, and look like more motion."""

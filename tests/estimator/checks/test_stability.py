@@ -45,10 +45,12 @@ def diagnosed(
     n_runs: int = 1,
     gusts: float = 0.0,
     ratio: float = 900.0,
+    fade: float = 1.0,
 ) -> Diagnostics:
     """White motion of a ratio; noise of all channels changes in the middle by a factor, in gusts.
 
-    Gusts last a segment each; the logarithm of their amplitude has this standard deviation.
+    Gusts last a segment each; the logarithm of their amplitude has this standard deviation. The
+    motion fades to `fade` of its amplitude.
     """
     rng = np.random.default_rng(seed)
     directions = np.concatenate([rotation(rng, 3) for _ in DIMS])
@@ -59,7 +61,8 @@ def diagnosed(
         noise *= np.exp(gusts * rng.standard_normal(n // HOP)).repeat(HOP)[:, None]
     if burst:
         noise[6400:6500, 4] += 40 * rng.standard_normal(100)
-    samples = np.sqrt(ratio) * rng.standard_normal((n, 3)) @ directions.T + noise
+    motion = np.sqrt(ratio) * np.linspace(1, fade, n)[:, None] * rng.standard_normal((n, 3))
+    samples = motion @ directions.T + noise
     settings = WelchSettings(100.0, LENGTH)
     single = SegmentSpectra(kept_bins(LENGTH // 2 + 1), 9)
     ends = PartEnds(part_bins(LENGTH // 2 + 1, 9), -(-N_SEGMENTS // MOST))
@@ -143,6 +146,21 @@ def test_gusts_are_noise_that_changes_and_neither_disturbances_nor_responses(rat
     kinds = {each.name for each in found.advice}
     assert "noise-changes" in kinds
     assert not kinds & {"disturbed-segments", "response-changes", "model-misfit"}
+
+
+@pytest.mark.parametrize("ratio", [0.05, 1.0])
+def test_noise_that_changes_is_told_from_weak_motion_that_fades(ratio: float) -> None:
+    """No frequency by itself shows the directions of such motion."""
+    gusty = diagnosed(4, gusts=1.0, ratio=ratio)
+    assert gusty.stability is not None
+    assert gusty.stability.inflation > 3
+    kinds = {each.name for each in gusty.advice}
+    assert "noise-changes" in kinds
+    assert "model-misfit" not in kinds
+    fading = diagnosed(4, ratio=ratio, fade=0.1)
+    assert fading.stability is not None
+    assert fading.stability.inflation < 1.2
+    assert "noise-changes" not in {each.name for each in fading.advice}
 
 
 def test_kept_segments_are_bounded_in_number() -> None:
