@@ -89,6 +89,41 @@ SHARED = SharedNoise(
     maximum_likelihood=0.06,
     channel=3,
 )
+CHANGED = ResponseChanges(
+    rank=Rank.DELAYS,
+    sensors=(1,),
+    channel=4,
+    is_turn=False,
+    size=-0.05,
+    size_error=0.0004,
+    begin=420.0,
+    end=420.0,
+    variance=6e-4,
+)
+DEAD = NoSignal(
+    rank=Rank.INVALIDATES,
+    sensors=(1,),
+    channels=(4,),
+    whole_sensor=False,
+    share_of_frequencies=1.0,
+)
+ALONE = NoSharedMotion(
+    rank=Rank.INVALIDATES,
+    sensors=(0,),
+    band=BAND,
+    partners=(1, 2),
+    share=0.012,
+    share_of_partners=0.98,
+)
+UNEQUAL = UnequalResponses(
+    rank=Rank.DELAYS,
+    sensors=(1,),
+    band=BAND,
+    channel=3,
+    share=0.12,
+    share_without=0.12,
+    equalised_by=(),
+)
 EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
     (
         SHARED,
@@ -124,60 +159,19 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        ResponseChanges(
-            rank=Rank.DELAYS,
-            sensors=(1,),
-            channel=4,
-            is_turn=False,
-            size=-0.05,
-            size_error=0.0004,
-            begin=420.0,
-            end=420.0,
-            variance=6e-4,
-        ),
+        CHANGED,
         ("The gain of b.y fell by 5 % at 420 s", "0.06 % of the motion's PSD", "--start"),
     ),
     (
-        ResponseChanges(
-            rank=Rank.DELAYS,
-            sensors=(1,),
-            channel=None,
-            is_turn=True,
-            size=8.7e-4,
-            size_error=5e-5,
-            begin=100.0,
-            end=300.0,
-            variance=2e-7,
-        ),
+        replace(CHANGED, channel=None, is_turn=True, size=8.7e-4, begin=100.0, end=300.0),
         ("Sensor b turned by 0.05° from 100 s to 300 s", "Fix the sensor"),
     ),
     (
-        ResponseChanges(
-            rank=Rank.DELAYS,
-            sensors=(1,),
-            channel=None,
-            is_turn=False,
-            size=-1.3,
-            size_error=0.1,
-            begin=420.0,
-            end=420.0,
-            variance=0.2,
-        ),
+        replace(CHANGED, channel=None, size=-1.3, size_error=0.1, variance=0.2),
         ("The gain of b fell by more than half at 420 s. Over", "Check its place and its cable"),
     ),
     (
-        ResponseChanges(
-            rank=Rank.DELAYS,
-            sensors=(1,),
-            band=(0.4, 0.8),
-            channel=None,
-            is_turn=False,
-            size=0.03,
-            size_error=0.001,
-            begin=420.0,
-            end=420.0,
-            variance=9e-4,
-        ),
+        replace(CHANGED, band=(0.4, 0.8), channel=None, size=0.03, variance=9e-4),
         ("The response of b varied by 3 % at 0.4–0.8 Hz at 420 s", "0.09 % of the motion's PSD"),
     ),
     (
@@ -199,23 +193,11 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        NoSignal(
-            rank=Rank.INVALIDATES,
-            sensors=(1,),
-            channels=(4,),
-            whole_sensor=False,
-            share_of_frequencies=1.0,
-        ),
+        DEAD,
         ("b.y has no signal (no power", "its noise cannot be estimated", "Check the cable"),
     ),
     (
-        NoSignal(
-            rank=Rank.INVALIDATES,
-            sensors=(1,),
-            channels=(3, 4, 5),
-            whole_sensor=True,
-            share_of_frequencies=1.0,
-        ),
+        replace(DEAD, channels=(3, 4, 5), whole_sensor=True),
         ("Sensor b has no signal on any channel", "their noise"),
     ),
     (
@@ -228,14 +210,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("b.y repeats a.y and b.z repeats a.z, sample for sample", "check the ports"),
     ),
     (
-        NoSharedMotion(
-            rank=Rank.INVALIDATES,
-            sensors=(0,),
-            band=BAND,
-            partners=(1, 2),
-            share=0.012,
-            share_of_partners=0.98,
-        ),
+        ALONE,
         (
             "Sensor a records none of the motion that b and c share at 2–8 Hz",
             "at most 1.2 % in common, b and c 98 % or more",
@@ -244,15 +219,7 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ),
     ),
     (
-        NoSharedMotion(
-            rank=Rank.INVALIDATES,
-            sensors=(0,),
-            band=BAND,
-            partners=(1, 2),
-            share=0.0,
-            share_of_partners=0.98,
-            for_part=True,
-        ),
+        replace(ALONE, share=0.0, for_part=True),
         (
             "that b and c share at 2–8 Hz for a part of the recording",
             "Estimate the part before (--end)",
@@ -360,40 +327,17 @@ EXAMPLES: list[tuple[Advice, tuple[str, ...]]] = [
         ("The samples of a lag those of b by 20 ms (0.8 samples)",),
     ),
     (
-        UnequalResponses(
-            rank=Rank.INVALIDATES,
-            sensors=(1,),
-            band=BAND,
-            channel=3,
-            share=0.94,
-            share_without=0.94,
-            equalised_by=(),
-        ),
+        replace(UNEQUAL, rank=Rank.INVALIDATES, share=0.94, share_without=0.94),
         ("The response of b differs from that of the others at", "94 % of the estimate of b.x"),
     ),
     (
-        UnequalResponses(
-            rank=Rank.DELAYS,
-            sensors=(0, 1, 2),
-            band=BAND,
-            channel=3,
-            share=0.12,
-            share_without=40.0,
-            equalised_by=("known", "estimated"),
+        replace(
+            UNEQUAL, sensors=(0, 1, 2), share_without=40.0, equalised_by=("known", "estimated")
         ),
         ("The responses of all sensors differ", "would be 40 times the noise of b.x", "12 % of"),
     ),
     (
-        UnequalResponses(
-            rank=Rank.DELAYS,
-            sensors=(1,),
-            band=BAND,
-            channel=3,
-            share=0.12,
-            share_without=0.12,
-            equalised_by=(),
-            unproven=(1,),
-        ),
+        replace(UNEQUAL, unproven=(1,)),
         ("filters for b did not lower the noise", "are not used", "12 % of"),
     ),
 ]
