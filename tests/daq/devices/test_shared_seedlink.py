@@ -114,9 +114,7 @@ async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
         await reader.until(server, BBB=200, AAA=200, CCC=200)
         for name in NAMES:
             reader.check(name)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await stack.aclose()
+        await _close(task, stack)
 
 
 async def test_a_station_that_a_later_connection_refuses_is_requested_again(
@@ -132,9 +130,7 @@ async def test_a_station_that_a_later_connection_refuses_is_requested_again(
         await reader.until(server, AAA=200, BBB=200, CCC=200)
         for name in NAMES:
             reader.check(name)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await stack.aclose()
+        await _close(task, stack)
 
 
 async def test_records_that_come_while_a_connection_is_opened_and_lost_are_recorded() -> None:
@@ -156,9 +152,7 @@ async def test_records_that_come_while_a_connection_is_opened_and_lost_are_recor
         await reader.until(server, BBB=200, CCC=200)
         for name in ("BBB", "CCC"):
             reader.check(name)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await stack.aclose()
+        await _close(task, stack)
 
 
 async def _opening(
@@ -190,6 +184,12 @@ async def _opened(
     return opening.result()
 
 
+async def _close(task: asyncio.Task[None], stack: contextlib.AsyncExitStack) -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await stack.aclose()
+
+
 async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
     async with Server(NAMES) as server:
         server.rates = {"BBB": 50}
@@ -206,9 +206,7 @@ async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
             reader.check(name)
         kinds = [(e.sensor, e.kind) for e in reader.items if isinstance(e, Event)]
         assert kinds == [("BBB", EventKind.REFUSED)]
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await stack.aclose()
+        await _close(task, stack)
 
 
 async def test_a_server_with_other_rates_only_is_named() -> None:

@@ -185,30 +185,21 @@ async def test_a_read_returns_when_the_expected_bytes_are_available(kind: str) -
             await reading
 
 
-async def test_a_terminal_with_a_limited_count_wakes_at_the_end_of_a_frame() -> None:
+@pytest.mark.parametrize(("n_frames", "n_pending"), [(3, 0), (2, 30)])
+async def test_a_terminal_with_a_limited_count_wakes_at_the_end_of_a_frame(
+    n_frames: int, n_pending: int
+) -> None:
+    """Bytes of the frame that are there already are not awaited again."""
     async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
         await stream.write(b"?")
         await far.arrived(1)
-        stream.expect(3, 100)
+        stream.expect(n_frames, 100, n_pending=n_pending)
         reading = asyncio.create_task(stream.read())
-        far.send(bytes(199))
+        far.send(bytes(199 - n_pending))
         done, _ = await asyncio.wait([reading], timeout=0.05)
         assert not done
         far.send(bytes(1))
-        assert len((await reading)[0]) == 200
-
-
-async def test_pending_bytes_of_a_frame_are_not_awaited_again() -> None:
-    async with _pseudo_terminal() as (port, far), open_port(port, SystemClock()) as stream:
-        await stream.write(b"?")
-        await far.arrived(1)
-        stream.expect(2, 100, n_pending=30)
-        reading = asyncio.create_task(stream.read())
-        far.send(bytes(169))
-        done, _ = await asyncio.wait([reading], timeout=0.05)
-        assert not done
-        far.send(bytes(1))
-        assert len((await reading)[0]) == 170
+        assert len((await reading)[0]) == 200 - n_pending
 
 
 async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
