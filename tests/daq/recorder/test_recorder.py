@@ -91,6 +91,11 @@ class Run:
         now = self.statuses[-1].sensors[sensor]
         return now.samples >= samples and now.state in states
 
+    async def sent(self, sensor: str, first: int, n: int, until: int | None = None) -> None:
+        """Send samples, and wait until the last of them, or `until`, is recorded."""
+        self.send(sensor, first, n)
+        await self.until(sensor, first + n if until is None else until)
+
     def send(self, sensor: str, first: int, n: int) -> None:
         """Let a device take samples and send them."""
         self.clock.advance(n / 100.0)
@@ -125,15 +130,12 @@ async def test_every_sensor_is_recorded(tmp_path: Path) -> None:
 async def test_a_lost_device_returns_and_the_other_continues(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b")
     async with run.going():
-        run.send("a", 0, 200)
-        await run.until("a", 200)
+        await run.sent("a", 0, 200)
         run.device("a").items.put_nowait(NotConnectedError("cable"))
         await run.until("a", 200, *LOST)
-        run.send("b", 0, 400)
-        await run.until("b", 400)
+        await run.sent("b", 0, 400)
         # 400 samples went by meanwhile; these come in a session of their own.
-        run.send("a", 0, 100)
-        await run.until("a", 300)
+        await run.sent("a", 0, 100, 300)
     assert run.device("a").n_sessions == 2
     assert run.device("b").n_sessions == 1
     with Recording.open(run.path) as recording:
@@ -152,13 +154,11 @@ async def test_a_stalled_device_is_detected_and_reconnected(tmp_path: Path) -> N
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
         run.send("a", 0, 100)
-        run.send("a", 100, 100)
-        await run.until("a", 200)
+        await run.sent("a", 100, 100)
         # Nothing comes any more, and nothing says so.
         await run.until("a", 200, SensorState.LATE)
         await run.until("a", 200, SensorState.STALLED, SensorState.WAITING)
-        run.send("a", 0, 100)
-        await run.until("a", 300)
+        await run.sent("a", 0, 100, 300)
     with Recording.open(run.path) as recording:
         kinds = [event.kind for event in recording.events if event.sensor == "a"]
         assert kinds == ["connected", "late", "stalled", "connected"]
@@ -171,8 +171,7 @@ async def test_one_lost_block_only_makes_a_sensor_late(tmp_path: Path) -> None:
         run.send("a", 50, 50)
         await run.until("a", 100, SensorState.LATE)
         run.clock.advance(0.5)
-        run.send("a", 150, 100)
-        await run.until("a", 200)
+        await run.sent("a", 150, 100, 200)
     assert run.device("a").n_sessions == 1
     with Recording.open(run.path) as recording:
         assert [e.kind for e in recording.events if e.sensor == "a"] == ["connected"]
@@ -184,8 +183,7 @@ async def test_events_of_the_decoder_do_not_make_a_sensor_lost(tmp_path: Path) -
     """Decoders call an answer or a block refused, too."""
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         for kind in (EventKind.REFUSED, EventKind.STALLED, EventKind.DISCONNECTED):
             run.device("a").items.put_nowait(Event("a", kind, "a block", run.clock.now()))
         run.device("a").items.put_nowait(Event("a", "status", "last", run.clock.now()))
@@ -206,8 +204,7 @@ async def test_a_faulty_block_ends_only_its_sensors_session(tmp_path: Path) -> N
         run.device("a").items.put_nowait(wrong)
         await run.until("a", 100, *LOST)
         run.send("b", 100, 100)
-        run.send("a", 0, 100)
-        await run.until("a", 200)
+        await run.sent("a", 0, 100, 200)
         await run.until("b", 200)
     assert run.statuses[-1].closed
     assert verify(run.path).intact
@@ -223,8 +220,7 @@ async def test_an_item_that_is_no_block_ends_only_its_session(tmp_path: Path) ->
     async with run.going():
         items.put_nowait(b"raw bytes")
         items.put_nowait(Event("c", "status", "of nobody", run.clock.now()))
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
     with Recording.open(run.path) as recording:
         assert [e.text for e in recording.events if e.kind == "disconnected"] == [
             "a: driver 'played' yielded bytes; expected a Block, an Event or a Reading",
@@ -238,8 +234,7 @@ async def test_a_driver_that_does_not_close_its_session_does_not_delay_the_end(
     run = Run(tmp_path / "r.h5", "a", "b")
     run.device("a").hangs = True
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
     assert run.statuses[-1].closed
     assert run.device("b").left_quiet
     with Recording.open(run.path) as recording:
@@ -252,8 +247,7 @@ async def test_a_driver_that_cannot_be_cancelled_is_abandoned(tmp_path: Path) ->
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").may_end = may_end = asyncio.Event()
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
     assert run.statuses[-1].closed
     with Recording.open(run.path) as recording:
         assert "the driver on a does not end; it was abandoned" in [
@@ -270,8 +264,7 @@ async def test_repeated_blocks_are_recorded_once(tmp_path: Path) -> None:
         run.send("a", 0, 100)
         run.send("a", 0, 100)
         run.send("a", 50, 150)
-        run.send("a", 190, 10)
-        await run.until("a", 200)
+        await run.sent("a", 190, 10)
     with Recording.open(run.path) as recording:
         np.testing.assert_array_equal(recording.sensors[0].counts(), counts(0, 200))
         said = [e.text for e in recording.events if e.kind == "resynchronised"]
@@ -285,8 +278,7 @@ async def test_an_error_in_a_driver_affects_only_its_device(tmp_path: Path) -> N
         run.send("b", 0, 100)
         await run.until("a", 100)
         run.device("a").items.put_nowait(ZeroDivisionError("a bug"))
-        run.send("a", 0, 100)
-        await run.until("a", 200)
+        await run.sent("a", 0, 100, 200)
     with Recording.open(run.path) as recording:
         assert ("disconnected", "a bug") in [(e.kind, e.text) for e in recording.events]
 
@@ -322,8 +314,7 @@ async def test_sensors_on_one_port_share_a_session(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a", "b", a="bus", b="bus")
     async with run.going():
         run.send("a", 0, 100)
-        run.send("b", 0, 100)
-        await run.until("b", 100)
+        await run.sent("b", 0, 100)
         await run.until("a", 100)
     assert run.device("bus").n_sessions == 1
 
@@ -332,8 +323,7 @@ async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
         run.device("a").items.put_nowait(Event("a", "checksum", "2 frames", run.clock.now()))
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
     with Recording.open(run.path) as recording:
         assert ("a", "checksum", "2 frames") in [
             (e.sensor, e.kind, e.text) for e in recording.events
@@ -355,8 +345,7 @@ async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) ->
         for k in range(1000):
             letters = "".join(chr(97 + int(c)) for c in str(k))
             items.put_nowait(Event("a", "checksum", f"noise {letters}", begin))
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
     with Recording.open(run.path) as recording:
         events = [e for e in recording.events if e.sensor == "a"]
     assert len([e for e in events if e.text == "answers again"]) == 10

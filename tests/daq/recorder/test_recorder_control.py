@@ -30,8 +30,7 @@ async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
 ) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         address = control_address(run.path)
         assert address is not None
         reader, writer = await connected(run.path)
@@ -46,8 +45,7 @@ async def test_a_silent_client_of_the_control_port_does_not_delay_the_end(
 async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going() as task:
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         status = await asyncio.to_thread(ask, run.path, "status")
         assert status["sensors"]["a"]["samples"] == 100
         await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
@@ -80,8 +78,7 @@ async def test_samples_that_were_not_counted_are_recorded_once(tmp_path: Path) -
     run = Run(tmp_path / "r.h5", "a")
     at = 1_468_458_187_000_000_000  # 01:03:07
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         said = f"{at} 2.500 1 a", f"{at + 4_000_000_000} 2.500 1 a", f"{at} 2.500 -3 a"
         for each in said:  # the second is the first, dated otherwise
             await asyncio.to_thread(ask, run.path, "uncounted", each)
@@ -101,8 +98,7 @@ async def test_samples_that_were_not_counted_are_recorded_once(tmp_path: Path) -
 async def test_invalid_requests_to_the_control_port_have_no_effect(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         for nonsense in (b"", b"\n", b"\xff" * 100 + b"\n", b"x" * 100_000):
             reader, writer = await connected(run.path)
             with contextlib.suppress(ConnectionError):

@@ -48,11 +48,9 @@ async def test_a_silent_sensor_of_a_port_is_recorded_without_only_on_request(
     assert not run.path.exists()
     run.anyway = True
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         assert run.statuses[-1].sensors["b"].state is SensorState.STALLED
-        run.send("b", 0, 100)
-        await run.until("b", 100)
+        await run.sent("b", 0, 100)
     with Recording.open(run.path) as recording:
         assert [sensor.n_samples for sensor in recording.sensors] == [100, 100]
 
@@ -70,16 +68,14 @@ async def test_another_device_on_the_port_is_refused(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     device = run.device("a")
     async with run.going():
-        run.send("a", 0, 100)
-        await run.until("a", 100)
+        await run.sent("a", 0, 100)
         device.serial_number = "2"
         device.items.put_nowait(NotConnectedError("cable"))
         while device.n_sessions < 3:
             device.opened.clear()
             await device.opened.wait()
         device.serial_number = "1"
-        run.send("a", 0, 100)
-        await run.until("a", 200)
+        await run.sent("a", 0, 100, 200)
     with Recording.open(run.path) as recording:
         refused = [e.text for e in recording.events if e.kind == "refused"]
         assert refused == ["sensor 'a' on a: expected serial number '1', got '2'"]
@@ -96,8 +92,7 @@ async def test_a_slightly_different_rate_is_accepted(tmp_path: Path) -> None:
     run = Run(tmp_path / "r.h5", "a")
     run.device("a").sampling_rate = 100.1
     async with run.going():
-        run.send("a", 0, 200)
-        await run.until("a", 200)
+        await run.sent("a", 0, 200)
     with Recording.open(run.path) as recording:
         assert recording.sensors[0].sampling_rate == 100.1
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -188,6 +189,15 @@ class Place:
             on_change=self.changes.append,
             tidy=lambda bench: _tidied(bench, self.store, self.clock),
         )
+
+    @asynccontextmanager
+    async def serving(self) -> AsyncIterator[Service]:
+        """Run the service until the end of the block."""
+        service = self.service()
+        task = asyncio.create_task(service.run())
+        yield service
+        service.request_stop()
+        await task
 
     async def serve(self, seconds: float, *, killed: bool = False) -> Service:
         """Serve for a while, then stop properly, or as if killed."""

@@ -355,53 +355,41 @@ async def test_a_reload_plans_anew_and_a_faulty_file_changes_nothing(tmp_path: P
         return bench_of(tmp_path, HOURLY.replace("0 *", "30 *"))
 
     place.reload = reload
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(60)
-    service.request_reload()
-    await asyncio.sleep(60)
-    assert place.states() == [("13:00", "due")]
-    service.request_reload()
-    await asyncio.sleep(60)
-    assert place.states() == [("12:30", "due")]
-    service.request_stop()
-    await task
+    async with place.serving() as service:
+        await asyncio.sleep(60)
+        service.request_reload()
+        await asyncio.sleep(60)
+        assert place.states() == [("13:00", "due")]
+        service.request_reload()
+        await asyncio.sleep(60)
+        assert place.states() == [("12:30", "due")]
 
 
 async def test_a_clock_set_back_repeats_no_run(tmp_path: Path) -> None:
     place = Place(tmp_path)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(1.5 * HOUR)
-    place.clock.set_by -= timedelta(hours=1)
-    await asyncio.sleep(1.4 * HOUR)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(1.5 * HOUR)
+        place.clock.set_by -= timedelta(hours=1)
+        await asyncio.sleep(1.4 * HOUR)
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
 async def test_a_clock_set_forward_by_years_has_missed_nothing(tmp_path: Path) -> None:
     place = Place(tmp_path)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(60)
-    place.clock.set_by += timedelta(days=4000)
-    await asyncio.sleep(1.3 * HOUR)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(60)
+        place.clock.set_by += timedelta(days=4000)
+        await asyncio.sleep(1.3 * HOUR)
     assert [state for _, state in place.states()] == ["done", "due"]
 
 
 async def test_a_clock_ahead_at_the_start_and_then_set_right(tmp_path: Path) -> None:
     place = Place(tmp_path)
     place.clock.set_by += timedelta(days=3)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(60)
-    place.clock.set_by -= timedelta(days=3)
-    await asyncio.sleep(1.3 * HOUR)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(60)
+        place.clock.set_by -= timedelta(days=3)
+        await asyncio.sleep(1.3 * HOUR)
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
     assert place.store.runs()[0].due.date() == place.clock.start.date()
 
@@ -409,14 +397,11 @@ async def test_a_clock_ahead_at_the_start_and_then_set_right(tmp_path: Path) -> 
 @pytest.mark.parametrize("days", [-3, 3])
 async def test_a_step_within_a_window_does_not_change_its_length(tmp_path: Path, days: int) -> None:
     place = Place(tmp_path)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(HOUR + 100)  # in the window of 13:00, which takes ten minutes
-    place.clock.set_by += timedelta(days=days)
-    place.steps.is_stuck = False
-    await asyncio.sleep(700)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(HOUR + 100)  # in the window of 13:00, which takes ten minutes
+        place.clock.set_by += timedelta(days=days)
+        place.steps.is_stuck = False
+        await asyncio.sleep(700)
     done = [run for run in place.store.runs() if run.state is RunState.DONE]
     assert len(done) == 1
     assert [seconds for _, seconds in place.steps.started] == [600]
@@ -429,13 +414,10 @@ async def test_a_run_planned_by_an_earlier_service_is_missed_once_the_clock_is_r
     place = Place(tmp_path)
     await place.serve(60)  # plans 13:00
     place.clock.set_by -= timedelta(days=3)  # off for a while; behind at the next start
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(60)
-    place.clock.set_by += timedelta(days=3, hours=2)
-    await asyncio.sleep(60)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(60)
+        place.clock.set_by += timedelta(days=3, hours=2)
+        await asyncio.sleep(60)
     # The service began at 14:01:30.
     assert place.states() == [("13:00", "missed"), ("14:00", "missed"), ("15:00", "due")]
 
@@ -447,18 +429,15 @@ async def test_the_first_run_waits_for_a_synchronised_clock(tmp_path: Path) -> N
     await asyncio.sleep(58 * 60)  # 12:59:30
     place.clock.synchronised = False
     place.clock.set_by -= timedelta(days=3)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(7 * 60)
-    assert (service.next_run, service.recording) == (None, None)
-    assert place.states() == [("13:00", "due")]
-    place.clock.set_by += timedelta(days=3)
-    place.clock.synchronised = True
-    await asyncio.sleep(60)
-    assert service.recording is not None
-    await asyncio.sleep(HOUR / 2)
-    service.request_stop()
-    await task
+    async with place.serving() as service:
+        await asyncio.sleep(7 * 60)
+        assert (service.next_run, service.recording) == (None, None)
+        assert place.states() == [("13:00", "due")]
+        place.clock.set_by += timedelta(days=3)
+        place.clock.synchronised = True
+        await asyncio.sleep(60)
+        assert service.recording is not None
+        await asyncio.sleep(HOUR / 2)
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
     run = place.store.runs()[0]
     assert run.reason == ""
@@ -473,17 +452,14 @@ async def test_without_synchronisation_runs_begin_after_ten_minutes_and_say_so(
     await place.serve(60)
     await asyncio.sleep(5.5 * HOUR)  # 17:31:30
     place.clock.synchronised = False
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(HOUR)  # 18:31:30
-    # What was missed is not reported by a clock that may be wrong.
-    assert place.states() == [("13:00", "due"), ("18:00", "done"), ("19:00", "due")]
-    run = place.store.runs()[1]
-    assert run.reason == "clock unverified: not synchronised when the run began"
-    place.clock.synchronised = True
-    await asyncio.sleep(60)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(HOUR)  # 18:31:30
+        # What was missed is not reported by a clock that may be wrong.
+        assert place.states() == [("13:00", "due"), ("18:00", "done"), ("19:00", "due")]
+        run = place.store.runs()[1]
+        assert run.reason == "clock unverified: not synchronised when the run began"
+        place.clock.synchronised = True
+        await asyncio.sleep(60)
     missed = [(f"{hour}:00", "missed") for hour in range(13, 18)]
     assert place.states() == [*missed, ("18:00", "done"), ("19:00", "due")]
 
@@ -492,13 +468,10 @@ async def test_a_run_that_is_due_while_the_clock_is_waited_for_begins_late(tmp_p
     place = Place(tmp_path)
     await asyncio.sleep(59 * 60)  # 12:59:30
     place.clock.synchronised = False
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(9.9 * 60)
-    assert place.states() == []
-    await asyncio.sleep(20 * 60)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(9.9 * 60)
+        assert place.states() == []
+        await asyncio.sleep(20 * 60)
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
@@ -509,24 +482,21 @@ async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
     free = 10**9
     for module in ("window", "service"):
         monkeypatch.setattr(f"tui.service.{module}.free_space", lambda _: free)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(HOUR + 70)  # 13:01:40
-    free = 10**8
-    await asyncio.sleep(300)  # 13:06:40
-    free = 10**9
-    await asyncio.sleep(0.5 * HOUR)
-    run = place.store.runs()[0]
-    assert run.state is RunState.DONE
-    assert "recording closed at 100 MB of free space" in run.reason
-    assert len(run.parts) == 2
-    assert 150 < place.steps.started[1][1] < 210  # what was left when there was space again
-    free = 10**8
-    await asyncio.sleep(HOUR)
-    free = 10**9
-    await asyncio.sleep(HOUR)
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(HOUR + 70)  # 13:01:40
+        free = 10**8
+        await asyncio.sleep(300)  # 13:06:40
+        free = 10**9
+        await asyncio.sleep(0.5 * HOUR)
+        run = place.store.runs()[0]
+        assert run.state is RunState.DONE
+        assert "recording closed at 100 MB of free space" in run.reason
+        assert len(run.parts) == 2
+        assert 150 < place.steps.started[1][1] < 210  # what was left when there was space again
+        free = 10**8
+        await asyncio.sleep(HOUR)
+        free = 10**9
+        await asyncio.sleep(HOUR)
     runs = place.store.runs()
     assert [run.state for run in runs] == ["done", "missed", "done", "due"]
     assert runs[1].reason == "100 MB of free space; expected at least 500 MB"
@@ -545,17 +515,14 @@ async def test_a_database_that_cannot_be_written_is_written_later(
         save(store, run)
 
     monkeypatch.setattr(RunStore, "save", failing)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(60)
-    is_broken = True
-    await asyncio.sleep(1.5 * HOUR)
-    assert place.states() == [("13:00", "due")]
-    is_broken = False
-    await asyncio.sleep(60)
-    assert place.states() == [("13:00", "done"), ("14:00", "due")]
-    service.request_stop()
-    await task
+    async with place.serving():
+        await asyncio.sleep(60)
+        is_broken = True
+        await asyncio.sleep(1.5 * HOUR)
+        assert place.states() == [("13:00", "due")]
+        is_broken = False
+        await asyncio.sleep(60)
+        assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
 def test_states_follow_the_machine() -> None:
