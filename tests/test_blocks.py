@@ -22,6 +22,7 @@ import pytest
 import tomlkit
 from typer.testing import CliRunner
 
+from tests.command import huddle
 from tui.commands.main import app
 
 ROOT = Path(__file__).parents[1]
@@ -92,8 +93,7 @@ def test_commands_print_what_is_shown(
             for word in words[1:]
             for name in (sorted(map(str, Path().glob(word))) if "*." in word else [word])
         ]
-        done = CliRunner().invoke(app, words, terminal_width=200)
-        assert done.exit_code == 0, done.output
+        done = huddle(*words, terminal_width=200)
         assert_prints(shown, done.stdout)
 
 
@@ -114,7 +114,7 @@ def test_tables_of_bench_files_are_accepted(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert CliRunner().invoke(app, ["init", "-o", "lab.toml"]).exit_code == 0
+    huddle("init", "-o", "lab.toml")
     Path("mask.csv").write_text("frequency (Hz),noise (µg/√Hz)\n1,1\n10,2\n", encoding="utf-8")
     secret = f'"sha256:{0:064x}"'
     for number, block in enumerate(blocks(page, "toml")):
@@ -122,8 +122,7 @@ def test_tables_of_bench_files_are_accepted(
         bench = Path(f"{number}.toml")
         whole = tomllib.loads(Path("lab.toml").read_text(encoding="utf-8"))
         bench.write_text(tomlkit.dumps(merged(whole, part)), encoding="utf-8")
-        done = CliRunner().invoke(app, ["check", str(bench), "--no-devices"])
-        assert done.exit_code == 0, done.output
+        huddle("check", bench, "--no-devices")
 
 
 @pytest.mark.long

@@ -24,6 +24,7 @@ from daq.recording.signing import (
     signature_of,
     signed_by,
 )
+from tests.command import huddle
 from tests.tui.service.bench_files import HOURLY, bench_of
 from tests.tui.service.test_continuations import record
 from tui.commands.main import app
@@ -118,8 +119,8 @@ def test_keys_are_private_and_not_replaced(signed: Path, tmp_path: Path) -> None
 def test_the_command_signs_what_is_intact(tmp_path: Path) -> None:
     record(tmp_path / "r.h5", 2)
     key, path = str(tmp_path / "k"), tmp_path / "r.h5"
-    assert CliRunner().invoke(app, ["sign", "--new-key", key]).exit_code == 0
-    assert CliRunner().invoke(app, ["sign", str(path), "--key", key]).exit_code == 0
+    huddle("sign", "--new-key", key)
+    huddle("sign", path, "--key", key)
     assert verified(path, "--key", f"{key}.pub").startswith("intact, signed")
     with h5py.File(path, "r+", libver="latest") as file:
         file.attrs["location"] = np.bytes_(b"elsewhere")

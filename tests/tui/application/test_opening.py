@@ -6,11 +6,10 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import huddle
 from tests.tui.example_snapshot import growing
 from tui.application.app import HuddleApp
-from tui.commands.main import app
 
 
 @pytest.mark.parametrize("name", ["lab.toml", "lab.h5"])
@@ -24,8 +23,7 @@ def test_without_a_terminal_it_says_what_does_without(
     else:
         with growing(path):
             pass
-    result = CliRunner().invoke(app, ["tui", str(path)])
-    assert result.exit_code == 2
+    result = huddle("tui", path, code=2)
     assert "huddle watch" in result.output
 
 
@@ -34,6 +32,5 @@ def test_a_recording_in_place_of_a_bench_file_is_called_that(tmp_path: Path, com
     path = tmp_path / "lab.h5"
     with growing(path):
         pass
-    result = CliRunner().invoke(app, [command, str(path)])
-    assert result.exit_code == 2
+    result = huddle(command, path, code=2)
     assert "lab.h5: is a recording; expected a bench file (.toml)" in result.output

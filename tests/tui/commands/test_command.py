@@ -24,6 +24,7 @@ from daq.preflight.device_check import SensorCheck
 from daq.python_process import python_command
 from docs import reference
 from sim_devices.world.paper_scenarios import SCENARIOS
+from tests.command import huddle, printed
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
 from tui.commands.main import app, main
@@ -31,13 +32,6 @@ from tui.output.plain_console import PlainConsole
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]
-
-
-def huddle(*arguments: str, code: int = 0) -> str:
-    """Run the command in this process; return its standard output."""
-    result = CliRunner().invoke(app, arguments, terminal_width=200)
-    assert result.exit_code == code, result.output
-    return result.stdout
 
 
 def modules_after(code: str) -> set[str]:
@@ -51,7 +45,7 @@ def modules_after(code: str) -> set[str]:
 
 
 def test_help_names_every_command() -> None:
-    said = huddle("--help")
+    said = printed("--help")
     for panel, commands in PANELS.items():
         assert f"\n{panel}:\n" in said
         for name, summary in commands.items():
@@ -73,7 +67,7 @@ def test_help_loads_nothing_that_takes_long(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_examples(name: str) -> None:
-    text = huddle(name, "--help")
+    text = printed(name, "--help")
     assert "Examples" in text
     assert f"huddle {name} " in text or f"huddle {name}\n" in text
 
@@ -87,7 +81,7 @@ def test_help_is_whole_where_python_drops_docstrings() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> None:
-    short, whole = huddle(name, "--help"), huddle(name, "--help-all")
+    short, whole = printed(name, "--help"), printed(name, "--help-all")
     options = re.findall(r"^  (?:-\w, )?(--[\w-]+)", short, re.MULTILINE)
     assert len(set(options) - {"--help", "--help-all"}) <= 10
     assert {*options} - {"--help-all"} <= {
@@ -104,7 +98,7 @@ def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> Non
     "name", ["estimate", "run", "record", "report", "check", "plan", "simulate", "import"]
 )
 def test_main_commands_have_a_worked_example_of_options_that_exist(name: str) -> None:
-    text = huddle(name, "--help").partition("Worked example:")[2]
+    text = printed(name, "--help").partition("Worked example:")[2]
     assert f"$ huddle {name} " in text
     assert max(map(len, text.splitlines())) <= 80
     for command, rest in re.findall(r"\$ huddle (\w+)(.*)", text):
@@ -113,15 +107,15 @@ def test_main_commands_have_a_worked_example_of_options_that_exist(name: str) ->
 
 
 def test_a_bare_command_and_help_show_help() -> None:
-    assert huddle() == huddle("--help") == huddle("help")
-    assert huddle("help", "estimate") == huddle("estimate", "--help")
+    assert printed() == printed("--help") == printed("help")
+    assert printed("help", "estimate") == printed("estimate", "--help")
     assert "No such command" in CliRunner().invoke(app, ["help", "nothing"]).output
-    assert huddle("-V") == huddle("--version")
+    assert printed("-V") == printed("--version")
 
 
 def test_shells_complete_commands_and_options() -> None:
     for shell in ("bash", "zsh", "fish"):
-        assert "_HUDDLE_COMPLETE" in huddle("completion", shell)
+        assert "_HUDDLE_COMPLETE" in printed("completion", shell)
     asked = {"_HUDDLE_COMPLETE": "complete_bash", "COMP_WORDS": "huddle estimate --segm"}
     done = subprocess.run(
         python_command("tui"),
@@ -147,7 +141,7 @@ IN_SHELLS = {
 def test_the_shells_themselves_complete(tmp_path: Path, shell: str) -> None:
     if shutil.which(shell) is None:
         pytest.skip(f"no {shell} here")
-    (tmp_path / "huddle").write_text(huddle("completion", shell), encoding="utf-8")
+    (tmp_path / "huddle").write_text(printed("completion", shell), encoding="utf-8")
     own = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     options = {"bash": ["--norc"], "zsh": ["-f"], "fish": ["--no-config"]}[shell]
     done = subprocess.run(
@@ -162,7 +156,7 @@ def test_the_shells_themselves_complete(tmp_path: Path, shell: str) -> None:
 
 
 def test_the_manual_has_every_command() -> None:
-    page = huddle("completion", "man")
+    page = printed("completion", "man")
     assert re.match(r'\.TH HUDDLE 1 "\d{4}-\d\d-\d\d" "huddle ', page)
     for name in COMMANDS:
         assert f"\n.SS huddle {name}\n" in page
@@ -174,7 +168,7 @@ def test_the_manual_has_every_command() -> None:
 
 def test_a_closed_pipe_is_no_failed_limit(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
-    huddle("simulate", "fig9", "--duration", "2min", "--out", str(path))
+    printed("simulate", "fig9", "--duration", "2min", "--out", str(path))
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "wb") as pipe:  # noqa: PTH123 - a descriptor
@@ -203,7 +197,7 @@ def test_files_and_pipes_have_a_row_on_a_line() -> None:
 
 def test_help_names_every_study_and_scenario() -> None:
     said = {
-        name: set(re.findall(r"[\w-]+", huddle(name, "--help")))
+        name: set(re.findall(r"[\w-]+", printed(name, "--help")))
         for name in ("reproduce", "simulate")
     }
     assert set(STUDIES) <= said["reproduce"]
@@ -221,7 +215,7 @@ def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
     sensors = {name: motion + 0.1 * rng.normal(size=(6000, 3)) for name in "ABC"}
     source, out = tmp_path / "a.npz", tmp_path / "a.h5"
     np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    huddle("import", str(source), "--out", str(out))
+    printed("import", str(source), "--out", str(out))
     loaded = modules_after(
         "import contextlib, io, tui.commands.main as command\n"
         "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):"
@@ -252,7 +246,7 @@ def test_an_estimate_loads_no_masked_arrays(scenario: str, tmp_path: Path) -> No
     """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
     path = tmp_path / "short.h5"
     named = str(ROOT / scenario) if scenario.endswith(".toml") else scenario
-    huddle("simulate", named, "--duration", "2min", "--out", str(path))
+    printed("simulate", named, "--duration", "2min", "--out", str(path))
     run = f"main(['estimate', {str(path)!r}])"
     loaded = modules_after(
         f"from tui.commands.main import main\ntry:\n    {run}\nexcept SystemExit:\n    print()"
@@ -312,9 +306,11 @@ def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
     sensors[names[1]][:, 2] *= -1
     source, out = tmp_path / "a.npz", tmp_path / "[b]a.h5"
     np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    assert f"{out} written" in "".join(huddle("import", str(source), "--out", str(out)).split("\n"))
+    assert f"{out} written" in "".join(
+        printed("import", str(source), "--out", str(out)).split("\n")
+    )
     json_file = tmp_path / "a.json"
-    said = huddle("estimate", str(out), "--segment", "1s", "--json", str(json_file))
+    said = printed("estimate", str(out), "--segment", "1s", "--json", str(json_file))
     words = " ".join(said.split())
     for name in names:
         assert name in said.split("▲ ")[0]  # the table
@@ -324,7 +320,7 @@ def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
     ]
     reversed_ = f"{label[5]} has the opposite polarity to {label[2]}"
     assert f"▲ {reversed_}: check the wires (and 1 more like this)" in words
-    long = " ".join(huddle("estimate", str(out), "--segment", "1s", "--details").split())
+    long = " ".join(printed("estimate", str(out), "--segment", "1s", "--details").split())
     assert f"{names[0]} → {names[1]}" in long
     assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in long
     assert f"All of these have {names[1]} in common" in long
@@ -341,11 +337,10 @@ def test_usage_is_exit_2(tmp_path: Path) -> None:
         ("estimate", "x.h5", "--segment", "soon"),
         ("fly",),
     ):
-        huddle(*arguments, code=2)
+        printed(*arguments, code=2)
     bench = tmp_path / "bench.toml"
     bench.write_text('name = "x"\nsampling_rat = 200\n')
-    result = CliRunner().invoke(app, ["check", str(bench)])
-    assert result.exit_code == 2
+    result = huddle("check", str(bench), code=2)
     for said in ("bench.toml", "sampling_rat", "sampling_rate", "sensors"):
         assert said in result.stderr
     assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
@@ -353,15 +348,13 @@ def test_usage_is_exit_2(tmp_path: Path) -> None:
 
 def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_text("not HDF5")
-    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "a.h5")])
-    assert result.exit_code == 3
+    result = huddle("estimate", str(tmp_path / "a.h5"), code=3)
     assert "a.h5: not a huddle recording" in result.stderr
     for name, command in (("b.csv", "import"), ("c.toml", "run")):
         (tmp_path / name).write_text("1,2\n")
         result = CliRunner().invoke(app, ["estimate", str(tmp_path / name)])
         assert f"huddle {command} {tmp_path / name}" in result.stderr
-    result = CliRunner().invoke(app, ["estimate", str(tmp_path / "none.h5")])
-    assert result.exit_code == 3
+    result = huddle("estimate", str(tmp_path / "none.h5"), code=3)
     assert "none.h5" in result.stderr
     assert "Traceback" not in result.output
 
@@ -374,10 +367,9 @@ def test_no_estimate_is_exit_3_and_says_what_is_wrong(tmp_path: Path, command: s
     sensors["r:2"] = sensors["r:1"]
     source, out = tmp_path / "a.npz", tmp_path / "a.h5"
     np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    huddle("import", str(source), "--out", str(out))
+    printed("import", str(source), "--out", str(out))
     options = ("--method", "three-sensor", "--segment", "1s")
-    result = CliRunner().invoke(app, [command, str(out), *options])
-    assert result.exit_code == 3
+    result = huddle(command, str(out), *options, code=3)
     assert "no channel's noise can be estimated at any frequency by three-sensor" in result.stderr
     assert re.search(r"r:2\.\S+ repeats r:1\.\S+, sample for sample", result.stderr)
     assert "One signal is connected or named twice" in result.stderr
@@ -391,18 +383,18 @@ def imported(tmp_path: Path) -> Path:
     sensors = {name: motion + 0.1 * rng.normal(size=(4000, 2)) for name in "ABC"}
     source, out = tmp_path / "a.npz", tmp_path / "a.h5"
     np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    huddle("import", str(source), "--out", str(out))
+    printed("import", str(source), "--out", str(out))
     return out
 
 
 def test_noise_parameters_on_request(tmp_path: Path) -> None:
     file = str(imported(tmp_path))
-    assert "Allan" not in huddle("estimate", file, "--segment", "1s")
-    said = huddle("estimate", file, "--segment", "1s", "--noise-parameters")
+    assert "Allan" not in printed("estimate", file, "--segment", "1s")
+    said = printed("estimate", file, "--segment", "1s", "--noise-parameters")
     assert re.search(r"channel +random walk +flicker +white +f² +quantisation", said)
     assert "Allan deviation of the self-noise" in said
     found = json.loads(
-        huddle("estimate", file, "--segment", "1s", "--noise-parameters", "--json", "-")
+        printed("estimate", file, "--segment", "1s", "--noise-parameters", "--json", "-")
     )
     first = found["noise_parameters"][0]
     white = first["terms"]["white"]
@@ -414,16 +406,14 @@ def test_noise_parameters_on_request(tmp_path: Path) -> None:
 
 def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
     file = str(imported(tmp_path))
-    result = CliRunner().invoke(app, ["estimate", file, "--segment", "1s", "--band", "60:70"])
-    assert result.exit_code == 2
+    result = huddle("estimate", file, "--segment", "1s", "--band", "60:70", code=2)
     assert "no frequency between 60 and 70 Hz" in result.stderr
     assert not result.stdout
 
 
 def test_a_window_that_nobody_knows_is_exit_2(tmp_path: Path) -> None:
     file = str(imported(tmp_path))
-    result = CliRunner().invoke(app, ["estimate", file, "--window", "hat"])
-    assert result.exit_code == 2
+    result = huddle("estimate", file, "--window", "hat", code=2)
     assert "--window 'hat'" in result.stderr
 
 
@@ -444,22 +434,20 @@ def test_output_survives_a_terminal_that_knows_no_signs(tmp_path: Path) -> None:
 
 def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
-    huddle("init", "--out", str(bench))
+    printed("init", "--out", str(bench))
     before = bench.read_text(encoding="utf-8")
-    assert ": no errors." in huddle("check", str(bench), "--no-devices")
-    refused = CliRunner().invoke(app, ["init", "--out", str(bench)])
-    assert refused.exit_code == 2
+    assert ": no errors." in printed("check", str(bench), "--no-devices")
+    refused = huddle("init", "--out", str(bench), code=2)
     assert "--force replaces it" in " ".join(refused.stderr.split())
     assert bench.read_text(encoding="utf-8") == before
 
 
 def test_check_names_sensor_and_port_that_are_not_there(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
-    huddle("init", "--out", str(bench))
+    printed("init", "--out", str(bench))
     text = bench.read_text(encoding="utf-8").replace("/dev/ttyUSB", f"{tmp_path}/tty")
     bench.write_text(text, encoding="utf-8")
-    result = CliRunner().invoke(app, ["check", str(bench), "--json", "-"])
-    assert result.exit_code == 3
+    result = huddle("check", str(bench), "--json", "-", code=3)
     for name, port in (("A", "tty0"), ("B", "tty1"), ("C", "tty2")):
         assert any(name in line and port in line for line in result.stderr.splitlines())
     assert len(json.loads(result.stdout)["errors"]) == 3
@@ -476,21 +464,20 @@ def test_check_says_where_a_serial_number_cannot_be_checked() -> None:
 
 def test_serve_lists_the_next_runs_and_wants_cron_lines(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
-    huddle("init", "--out", str(bench))
-    result = CliRunner().invoke(app, ["serve", str(bench), "--list"])
-    assert result.exit_code == 2
+    printed("init", "--out", str(bench))
+    result = huddle("serve", str(bench), "--list", code=2)
     assert "schedule.cron" in result.stderr
     with bench.open("a", encoding="utf-8") as lines:
         lines.write('\n[schedule]\ncron = ["30 22 * * 1-5"]\ntime_zone = "Europe/Berlin"\n')
-    times = json.loads(huddle("serve", str(bench), "--list", "--json", "-"))["next"]
+    times = json.loads(printed("serve", str(bench), "--list", "--json", "-"))["next"]
     assert len(times) == 5
     assert all("T22:30:00" in time for time in times)
 
 
 def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
-    huddle("init", "--out", str(bench))
-    found = json.loads(huddle("plan", str(bench), "--cov", "0.05", "--json", "-"))["methods"]
+    printed("init", "--out", str(bench))
+    found = json.loads(printed("plan", str(bench), "--cov", "0.05", "--json", "-"))["methods"]
     plans = {entry["method"]: entry for entry in found}
     # √(2.5 / n) is the c.o.v. of equal, orthogonal channels: 1000 averages, 5 s apart under Hann.
     # The third of an octave from 1 Hz on has three frequencies, worth 1.83 independent ones.
@@ -498,20 +485,19 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
     assert max(map(abs, plans["three-sensor"]["bias"])) < 1e-3
     assert max(plans["three-channel"]["bias"]) > 1
     assert all(0.9 < share <= 1 for share in plans["three-sensor"]["efficiency"])
-    shown = huddle("plan", str(bench), "--cov", "0.05")
+    shown = printed("plan", str(bench), "--cov", "0.05")
     assert "3 sensors cannot tell gradients of the motion from noise" in " ".join(shown.split())
     assert "efficiency" in shown
     assert "motion too weak" not in shown
-    assert "motion too weak" in huddle("plan", str(bench), "--snr", "1e-5")
+    assert "motion too weak" in printed("plan", str(bench), "--snr", "1e-5")
     for snr in ("inf", "1e30", "nan"):
-        refused = CliRunner().invoke(app, ["plan", str(bench), "--snr", snr])
-        assert refused.exit_code == 2
+        huddle("plan", str(bench), "--snr", snr, code=2)
 
 
 def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
     bench, out = str(tmp_path / "lab.toml"), str(tmp_path / "model.h5")
     said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8") + reference.result()
-    huddle("init", "--out", bench)
+    printed("init", "--out", bench)
     for command in (
         ("check", bench, "--no-devices"),
         ("plan", bench),
@@ -519,6 +505,6 @@ def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
         ("repair", out, "--check"),
         ("estimate", out, "--noise-parameters", "--segment", "2s"),
     ):
-        document = json.loads(huddle(*command, "--json", "-"))
+        document = json.loads(printed(*command, "--json", "-"))
         missing = [key for key in document if f"`{key}`" not in said]
         assert not missing, command

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_names, driver_type
 from daq.errors import BenchFileError
+from tests.command import huddle
 from tests.daq.devices.test_sound import ALSA, CARD, has_portaudio
 from tests.waiting import limit
 from tui.commands.main import app
@@ -36,15 +37,13 @@ def test_a_misspelt_driver_is_a_fault_of_the_file(tmp_path: Path) -> None:
         parse(BENCH)
     path = tmp_path / "b.toml"
     path.write_text(BENCH, encoding="utf-8")
-    result = CliRunner().invoke(app, ["check", str(path), "--no-devices"])
-    assert result.exit_code == 2
+    result = huddle("check", path, "--no-devices", code=2)
     assert "Traceback" not in result.stderr
 
 
 @pytest.mark.parametrize("name", driver_names())
 def test_the_settings_of_every_driver_are_listed_with_what_they_mean(name: str) -> None:
-    result = CliRunner().invoke(app, ["devices", "--driver", name, "--json", "-"])
-    assert result.exit_code == 0, result.stderr
+    result = huddle("devices", "--driver", name, "--json", "-")
     told = json.loads(result.stdout)
     assert told["summary"] == driver_type(name).summary
     settings = driver_type(name).settings.model_fields
@@ -57,13 +56,12 @@ def test_the_settings_of_every_driver_are_listed_with_what_they_mean(name: str) 
 
 
 def test_a_driver_that_is_not_installed_is_named_with_those_that_are() -> None:
-    result = CliRunner().invoke(app, ["devices", "--driver", "none"])
-    assert result.exit_code == 2
+    result = huddle("devices", "--driver", "none", code=2)
     assert all(driver_type(name).summary[:20] in result.stderr for name in driver_names())
 
 
 def test_a_bench_file_or_a_driver() -> None:
-    assert CliRunner().invoke(app, ["devices", "a.toml", "--driver", "epson"]).exit_code == 2
+    huddle("devices", "a.toml", "--driver", "epson", code=2)
 
 
 @pytest.mark.skipif(not has_portaudio(), reason="PortAudio or ALSA is not installed")
@@ -87,7 +85,6 @@ def test_without_either_ports_of_this_computer_are_listed(tmp_path: Path) -> Non
 
 def test_a_driver_without_its_library_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", None)
-    result = CliRunner().invoke(app, ["devices"])
-    assert result.exit_code == 0
+    result = huddle("devices")
     assert "not listed: sound" in result.stdout
     assert "pip install 'sounddevice>=0.5'" in " ".join(result.stdout.split())

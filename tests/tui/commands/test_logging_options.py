@@ -13,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.python_process import python_command
+from tests.command import huddle
 from tui.commands.main import app
 
 LONG = ("run", "record", "watch", "serve", "devices", "demo", "import", "simulate", "reproduce")
@@ -104,16 +105,14 @@ def test_on_a_terminal_log_lines_stay_whole_beside_the_progress_bar(
     "command", [("run", "--bad"), ("--bad",), ("estimate", "x.h5", "--json", "nowhere/x")]
 )
 def test_wrong_usage_is_said_in_plain_lines_without_boxes(command: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 2
+    result = huddle(*command, code=2)
     assert result.stderr
     assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
 
 
 def test_an_error_is_a_record_where_json_is_wanted(tmp_path: Path) -> None:
     missing = str(tmp_path / "missing.toml")
-    result = CliRunner().invoke(app, ["record", missing, "--log-format", "json"])
-    assert result.exit_code == 2
+    result = huddle("record", missing, "--log-format", "json", code=2)
     (line,) = result.stderr.splitlines()
     entry = json.loads(line)
     assert (entry["level"], entry["exit_code"]) == ("error", 2)

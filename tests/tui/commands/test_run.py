@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from daq.bench.end_condition import EndCondition
 from daq.bench.loading import dump
@@ -21,8 +20,8 @@ from daq.devices.bench_file import parse
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
+from tests.command import huddle
 from tests.waiting import finish, wait_until
-from tui.commands.main import app
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")
 
@@ -35,13 +34,6 @@ def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
-
-
-def huddle(*arguments: str, code: int = 0) -> Result:
-    """Run a command in this process: what it imports is there already."""
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == code, result.output
-    return result
 
 
 def wait_for_samples(process: subprocess.Popen[str], path: Path, n_samples: int) -> None:

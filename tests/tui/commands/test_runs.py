@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.errors import HuddleError
+from tests.command import huddle, printed
 from tests.torture.damaged_files import make_recording
 from tests.tui.service.bench_files import START
 from tui.commands.main import app
@@ -25,17 +26,11 @@ from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore, StoreError
 
 
-def huddle(*arguments: str, code: int = 0) -> str:
-    result = CliRunner().invoke(app, arguments, terminal_width=200)
-    assert result.exit_code == code, result.output
-    return result.stdout
-
-
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
     """Return a bench file whose service has done a run, failed one, and plans another."""
     bench = tmp_path / "lab.toml"
-    huddle("init", "--out", str(bench))
+    printed("init", "--out", str(bench))
     with bench.open("a", encoding="utf-8") as file:
         file.write('\n[[schedule]]\ncron = "0 22 * * *"\ntime_zone = "UTC"\n')
     store = RunStore(tmp_path / "recordings")
@@ -50,30 +45,29 @@ def place(tmp_path: Path) -> Path:
 
 
 def test_runs_as_table_json_and_csv(place: Path) -> None:
-    table = huddle("runs", str(place))
+    table = printed("runs", str(place))
     assert [line.split()[3] for line in table.splitlines()[1:]] == ["done", "failed", "due"]
-    runs = json.loads(huddle("runs", str(place), "--json", "-"))["runs"]
+    runs = json.loads(printed("runs", str(place), "--json", "-"))["runs"]
     assert [run["verdict"] for run in runs] == ["pass", None, None]
     rows = list(
         csv.DictReader(
             io.StringIO(
-                huddle("runs", str(place.parent / "recordings"), "--last", "2", "--csv", "-")
+                printed("runs", str(place.parent / "recordings"), "--last", "2", "--csv", "-")
             )
         )
     )
     assert [row["reason"] for row in rows] == ["'=1+1", ""]  # no formula for a spreadsheet
-    nowhere = CliRunner().invoke(app, ["runs", str(place.parent)])
-    assert nowhere.exit_code == 2
+    nowhere = huddle("runs", str(place.parent), code=2)
     assert "runs.sqlite: does not exist" in nowhere.stderr
 
 
 def test_pinned_by_recording_or_time(place: Path) -> None:
-    huddle("pin", str(place), "a.h5", "2026-11-21 13:00")
+    printed("pin", str(place), "a.h5", "2026-11-21 13:00")
     store = RunStore(place.parent / "recordings")
     assert [run.pinned for run in store.runs()] == [True, True, False]
     store.save(replace(store.runs()[0], pinned=False))  # by a service that knows nothing of it
     assert store.runs()[0].pinned
-    huddle("pin", str(place), "recordings/a.h5", "--remove")
+    printed("pin", str(place), "recordings/a.h5", "--remove")
     assert [run.pinned for run in store.runs()] == [False, True, False]
     assert "no such run" in CliRunner().invoke(app, ["pin", str(place), "b.h5"]).stderr
     for kept in (True, False):  # by a key of the application
@@ -84,7 +78,7 @@ def test_pinned_by_recording_or_time(place: Path) -> None:
 
 
 def test_verify_walks_what_is_kept(place: Path) -> None:
-    found = json.loads(huddle("verify", str(place), "--json", "-"))["recordings"]
+    found = json.loads(printed("verify", str(place), "--json", "-"))["recordings"]
     assert [entry["intact"] for entry in found] == [True]
     assert [len(entry["root_sha256"]) for entry in found] == [64]
     path = place.parent / "recordings" / "a.h5"
@@ -93,15 +87,14 @@ def test_verify_walks_what_is_kept(place: Path) -> None:
     content = bytearray(path.read_bytes())
     content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
     path.write_bytes(content)
-    result = CliRunner().invoke(app, ["verify", str(place)])
-    assert result.exit_code == 3
+    result = huddle("verify", str(place), code=3)
     assert "1 of 1 recordings are damaged or lost" in result.stderr
     path.unlink()
-    huddle("verify", str(place), code=3)
+    printed("verify", str(place), code=3)
 
 
 def test_status_with_and_without_a_service(place: Path) -> None:
-    found = json.loads(huddle("status", str(place), "--json", "-", code=3))
+    found = json.loads(printed("status", str(place), "--json", "-", code=3))
     assert found["running"] is False
     assert found["last"]["state"] == "failed"
     assert found["next"]["due"].startswith("2037-11-03")
@@ -110,7 +103,7 @@ def test_status_with_and_without_a_service(place: Path) -> None:
     assert bench is not None
     lock = Lock.take(service_lock(bench))
     assert lock is not None
-    text = huddle("status", str(place))
+    text = printed("status", str(place))
     lock.release()
     assert "service    running" in text
     assert "last run   1 of 2026-11-21T13:00:30Z: failed (=1+1)" in text

@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 from rich.text import Text
-from typer.testing import CliRunner
 
 from daq.python_process import python_command
 from daq.recorder.block_writer import SensorProgress
 from daq.recorder.recorder import RecorderStatus
 from daq.recording.sensor_state import SensorState
-from tui.commands.main import app
+from tests.command import huddle
 from tui.commands.record import progress_line
 from tui.output.console import (
     console,
@@ -88,8 +87,7 @@ def test_files_and_pipes_get_no_progress_and_lines_of_their_width(
 def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(
     command: tuple[str, ...],
 ) -> None:
-    result = CliRunner().invoke(app, [*command, "nowhere/result"])
-    assert result.exit_code == 2
+    result = huddle(*command, "nowhere/result", code=2)
     assert "there is no folder" in result.output
 
 
@@ -103,8 +101,7 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(
 def test_places_that_cannot_take_a_result_are_told_before_anything_is_measured(
     options: tuple[str, ...], said: str
 ) -> None:
-    result = CliRunner().invoke(app, ["estimate", "nothing.h5", *options])
-    assert result.exit_code == 2
+    result = huddle("estimate", "nothing.h5", *options, code=2)
     assert said in result.output
 
 
@@ -124,8 +121,7 @@ def test_the_application_says_what_to_do_with_other_files(
     monkeypatch.chdir(tmp_path)
     Path("arrays.npz").write_bytes(b"\xff")
     Path("lab.toml").touch()
-    result = CliRunner().invoke(app, ["tui", source])
-    assert result.exit_code == 2
+    result = huddle("tui", source, code=2)
     assert said in " ".join(result.output.split())
 
 
@@ -134,8 +130,7 @@ def test_the_application_without_a_file_says_what_there_is(
 ) -> None:
     (tmp_path / "lab.toml").touch()
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["tui"])
-    assert result.exit_code == 2
+    result = huddle("tui", code=2)
     assert "lab.toml" in result.output
     assert "huddle init" in result.output
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 import pytest
 from pypdf import PdfReader
 
-from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.results.result import Result
-from daq.results.sources import sources
 from tests.tui.night_recording import record
-from tests.tui.report.written_report import Reported, paper_of
+from tests.tui.report.written_report import Reported, paper_of, result_of
 from tui.report.contents import report_of
 
 
@@ -24,13 +21,8 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
         target_cov=0.1,
         axis_tolerance={"": 0.0},
     )
-    snapshot = estimate([recording], settings)
-    report = report_of(
-        Result(
-            snapshot, settings, sources([recording])[0].bench, examined=tuple(sources([recording]))
-        )
-    )
-    return Reported(recording, snapshot, settings, report)
+    result = result_of(settings, recording)
+    return Reported(recording, result.snapshot, settings, report_of(result))
 
 
 @pytest.fixture(scope="session")

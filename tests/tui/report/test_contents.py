@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from daq.caveats import Caveat, Caveats
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from daq.results.sources import sources
+from tests.command import huddle
 from tests.tui.example_snapshot import SETTINGS, demo_bench, diagnosed
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import (
@@ -25,10 +25,10 @@ from tests.tui.report.written_report import (
     assert_as_kept,
     by_channel,
     lines_of,
+    result_of,
     tables,
     texts_of,
 )
-from tui.commands.main import app
 from tui.output.json_document import result_document
 from tui.page.blocks import Plot, Section
 from tui.page.table import Cell, Table, tone_of
@@ -109,8 +109,7 @@ def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path)
     assert list(rows)[:2] == [f"{HOSTILE}.Y", f"{HOSTILE}.X"]  # the worst sensor first
 
     failing = record(tmp_path / "noisy.h5", psd=5e-11)
-    result = CliRunner().invoke(app, ["report", str(failing), "--out", str(tmp_path / "n.html")])
-    assert result.exit_code == 1
+    result = huddle("report", failing, "--out", str(tmp_path / "n.html"), code=1)
     assert "FAIL: 7 of 8 channels above data sheet" in " ".join(result.stdout.split())
     assert "FAIL" in (tmp_path / "n.html").read_text(encoding="utf-8")
 
@@ -119,14 +118,7 @@ def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
     reported: Reported,
 ) -> None:
     settings = replace(reported.settings, methods=("all",))
-    report = report_of(
-        Result(
-            estimate([reported.recording], settings),
-            settings,
-            sources([reported.recording])[0].bench,
-            examined=tuple(sources([reported.recording])),
-        )
-    )
+    report = report_of(result_of(settings, reported.recording))
     (table,) = tables(report, "Result")
     methods, *_ = tables(report, "Uncertainty")
     assert "by the three-sensor method" in table.title
@@ -182,12 +174,7 @@ def test_alignment_clocks_and_model_test_are_there(reported: Reported) -> None:
 def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
     recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
     record(recording, before_end=lambda: shutil.copyfile(recording, copy))
-    snapshot = estimate([copy], reported.settings)
-    report = report_of(
-        Result(
-            snapshot, reported.settings, sources([copy])[0].bench, examined=tuple(sources([copy]))
-        )
-    )
+    report = report_of(result_of(reported.settings, copy))
     assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
     assert hashlib.sha256(copy.read_bytes()).hexdigest() in texts_of(report)
 
@@ -202,11 +189,9 @@ def test_where_the_motion_is_not_shared_the_report_says_so(tmp_path: Path) -> No
         for name, share in (("A", 0.0), ("B", 0.2), ("C", 0.0), ("D", 0.2))
     }
     np.savez(source, sampling_rate=RATE, **sensors)
-    runner = CliRunner()
     recording = str(tmp_path / "a.h5")
-    assert runner.invoke(app, ["import", str(source), "--out", recording]).exit_code == 0
-    result = runner.invoke(app, ["report", recording, "--segment", "1s"])
-    assert result.exit_code == 0, result.output
+    huddle("import", source, "--out", recording)
+    huddle("report", recording, "--segment", "1s")
     text = Words((tmp_path / "a.html").read_text(encoding="utf-8")).text
     assert re.search(r"The test fails at [\d.]+–50 Hz \(statistic \d+", text)
     assert "No verdict: the bench file has no limits." in text
@@ -227,11 +212,7 @@ def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
 
 def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> None:
     other = record(tmp_path / "second.h5")
-    files = [reported.recording, other]
-    snapshot = estimate(files, reported.settings)
-    report = report_of(
-        Result(snapshot, reported.settings, sources(files)[0].bench, examined=tuple(sources(files)))
-    )
+    report = report_of(result_of(reported.settings, reported.recording, other))
     text = " ".join(texts_of(report))
     assert "night.h5" in text
     assert "second.h5" in text

@@ -13,14 +13,10 @@ import pytest
 from matplotlib.axes import Axes
 from pypdf import PageObject, PdfReader
 from pypdf.generic import Destination
-from typer.testing import CliRunner
 
-from daq.estimation.estimation import estimate
-from daq.results.result import Result
-from daq.results.sources import sources
+from tests.command import huddle
 from tests.tui.night_recording import RATE
-from tests.tui.report.written_report import Reported, Words, paper_of, texts_of
-from tui.commands.main import app
+from tests.tui.report.written_report import Reported, Words, paper_of, result_of, texts_of
 from tui.page.blocks import KeyValues, Paragraph, Plot, Report, Section
 from tui.page.drawing import WIDTH
 from tui.page.table import Table
@@ -120,17 +116,8 @@ def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_pa
     source, recording = tmp_path / "a.npz", tmp_path / "a.h5"
     sensors = {f"S{i:02}": motion + 100 * rng.standard_normal((2000, 1)) for i in range(15)}
     np.savez(source, sampling_rate=RATE, **sensors)  # type: ignore[arg-type]  # names of arrays
-    runner = CliRunner()
-    assert runner.invoke(app, ["import", str(source), "--out", str(recording)]).exit_code == 0
-    snapshot = estimate([recording], reported.settings)
-    report = report_of(
-        Result(
-            snapshot,
-            reported.settings,
-            sources([recording])[0].bench,
-            examined=tuple(sources([recording])),
-        )
-    )
+    huddle("import", source, "--out", recording)
+    report = report_of(result_of(reported.settings, recording))
     plots = [part for s in report.sections for part in s.parts if isinstance(part, Plot)]
     assert (
         sum(len(plot.panels) for plot in plots) == 15 + 15 + 1 + 15 + 2 + 3
@@ -149,10 +136,8 @@ def test_a_pass_of_two_minutes_has_its_result_on_page_one_and_four_pages(tmp_pat
     written = files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     bench, recording, out = (tmp_path / name for name in ("b.toml", "b.h5", "b.pdf"))
     bench.write_text(written.replace("[recording]", f"{limit}[recording]"), encoding="utf-8")
-    run = CliRunner()
-    simulated = run.invoke(app, ["simulate", str(bench), "-d", "2min", "--out", str(recording)])
-    assert simulated.exit_code == 0, simulated.output
-    assert run.invoke(app, ["report", str(recording), "--out", str(out)]).exit_code == 0
+    huddle("simulate", bench, "-d", "2min", "--out", recording)
+    huddle("report", recording, "--out", out)
     first, second, *others = (page.extract_text() for page in PdfReader(out).pages)
     assert len(others) <= 2
     assert "PASS: all 9 channels are below sheet." in first

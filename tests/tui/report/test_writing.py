@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from daq.bench.masks.mask_file import masks_named
 from daq.devices.bench_file import load
+from tests.command import huddle
 from tests.full_disk import files_limited_to
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, Reported, Words
@@ -64,8 +65,7 @@ def test_a_wrong_name_is_refused_before_anything_is_done(
     reported: Reported, out: str, said: str, tmp_path: Path
 ) -> None:
     arguments = ["report", str(reported.recording), "--out", str(tmp_path / out)]
-    result = CliRunner().invoke(app, arguments, terminal_width=300)
-    assert result.exit_code == 2
+    result = huddle(*arguments, terminal_width=300, code=2)
     assert re.search(said, result.stderr)
 
 
@@ -75,14 +75,13 @@ def test_a_draft_replaces_no_other_one_unless_forced(reported: Reported, tmp_pat
     out = tmp_path / "night.html"
     arguments = ["report", str(reported.recording), "--out", str(out), "--segment", "1s"]
     run = CliRunner()
-    assert run.invoke(app, arguments).exit_code == 4
+    huddle(*arguments, code=4)
     first = out.read_bytes()
     assert run.invoke(app, arguments).exit_code == 4  # the same once more changes nothing
-    refused = run.invoke(app, [*arguments[:-1], "2s"])
-    assert refused.exit_code == 3
+    refused = huddle(*arguments[:-1], "2s", code=3)
     assert "exists with other content" in refused.stderr
     assert out.read_bytes() == first
-    assert run.invoke(app, [*arguments[:-1], "2s", "--force"]).exit_code == 4
+    huddle(*arguments[:-1], "2s", "--force", code=4)
     page = Words(out.read_text(encoding="utf-8")).text
     assert "segment 1 s → 2 s" in page
     _, beside = write(reported.result, out, taken="beside")

@@ -11,6 +11,7 @@ from functools import cached_property
 from html.parser import HTMLParser
 from pathlib import Path
 
+from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
@@ -21,6 +22,13 @@ from tui.page.pdf import write_paper
 from tui.page.table import Table
 
 ROOT = Path(__file__).parents[3]
+
+
+def result_of(settings: Settings, *recordings: Path, snapshot: Snapshot | None = None) -> Result:
+    """Return the result of recordings, or of a snapshot as if it were theirs."""
+    found = tuple(sources(recordings))
+    made = estimate(recordings, settings) if snapshot is None else snapshot
+    return Result(made, settings, found[0].bench, examined=found)
 
 
 @dataclass(frozen=True)
@@ -35,8 +43,7 @@ class Reported:
     @property
     def result(self) -> Result:
         """What the report is of."""
-        found = tuple(sources([self.recording]))
-        return Result(self.snapshot, self.settings, found[0].bench, recordings=(self.recording,))
+        return result_of(self.settings, self.recording, snapshot=self.snapshot)
 
     @cached_property
     def page(self) -> str:

@@ -14,16 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from daq.caveats import Caveat, Caveats
 from daq.protocols.block import HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.signing import identity, make_key, problem, signed_by
 from daq.recording.writer import RecordingWriter
+from tests.command import huddle
 from tests.tui.service.bench_files import HOURLY, START, Place
 from tests.tui.service.test_continuations import record
-from tui.commands.main import app
 from tui.service.healing import heal
 from tui.service.planning import next_runs
 from tui.service.processes.finish import Outcome, Request, finish
@@ -222,12 +221,11 @@ def test_verify_finds_recordings_that_were_exchanged(tmp_path: Path) -> None:
         run = replace(run, due=run.due + timedelta(hours=number))
         place.store.save(run)
         place.store.set_identities(run, [(name, *identity(folder / name))])
-    assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
+    huddle("verify", folder)
     (folder / "a.h5").rename(folder / "c.h5")
     (folder / "b.h5").rename(folder / "a.h5")
     (folder / "c.h5").rename(folder / "b.h5")
-    said = CliRunner().invoke(app, ["verify", str(folder)], terminal_width=400)
-    assert said.exit_code == 3
+    said = huddle("verify", folder, terminal_width=400, code=3)
     assert said.stdout.count("exchanged: not the recording that the service has made") == 2
 
 

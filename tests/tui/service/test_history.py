@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from daq.caveats import Caveat, Caveats
 from daq.results.change_test import BLOCK, DECIBEL, WIDTHS, Evidence, FloatArray, changes
+from tests.command import huddle, printed
 from tests.tui.service.bench_files import START
-from tui.commands.main import app
 from tui.service.history.series import history
 from tui.service.history.shown import history_figure, history_table, label_lines
 from tui.service.records.run_state import RecordedNoise, Run, RunState
@@ -191,37 +190,29 @@ def test_simulated_runs_are_compared_with_their_like_only() -> None:
     assert panel.get_title("left") == "a S1, simulated, 1 to 10 Hz"
 
 
-def huddle(*arguments: str, code: int = 0) -> str:
-    result = CliRunner().invoke(app, arguments, terminal_width=200)
-    assert result.exit_code == code, result.output
-    return result.stdout
-
-
 def test_the_command_says_shows_and_draws_it(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     store = RunStore(folder)
     for day in range(24):
         store.save(run_with(day, 0.0 if day < 12 else 3.0))
-    text = huddle("history", str(folder))
+    text = printed("history", str(folder))
     assert "a.x (S1), 1 to 10 Hz: +3.00 ±" in text
     assert "dB since 2026-12-03 12:00, decided by the run of 2026-12-0" in text
     assert "false alarm in 0.01 of all histories" in text
     picture = tmp_path / "noise.svg"
-    found = json.loads(huddle("history", str(folder), "--json", "-", "--out", str(picture)))
+    found = json.loads(printed("history", str(folder), "--json", "-", "--out", str(picture)))
     assert found["series"][0]["changes"][0]["shift_db"] == pytest.approx(3.0)
     assert len(found["series"][0]["runs"]) == 24
     drawn = picture.read_text(encoding="utf-8")
     assert "a S1, 1 to 10 Hz" in drawn
-    rows = list(csv.DictReader(io.StringIO(huddle("history", str(folder), "--csv", "-"))))
+    rows = list(csv.DictReader(io.StringIO(printed("history", str(folder), "--csv", "-"))))
     assert len(rows) == 24
     assert rows[0]["serial_number"] == "S1"
     assert float(rows[0]["psd"]) == 1e-12
     since = ("--since", "2026-12-08")
-    (series,) = json.loads(huddle("history", str(folder), *since, "--json", "-"))["series"]
+    (series,) = json.loads(printed("history", str(folder), *since, "--json", "-"))["series"]
     assert series["runs"][0]["due"] == "2026-12-08T12:00:30Z"
     assert (len(series["runs"]), series["changes"]) == (7, [])
-    wrong = CliRunner().invoke(app, ["history", str(folder), "--since", "last week"])
-    assert wrong.exit_code == 2
-    refused = CliRunner().invoke(app, ["history", str(folder), "--band", "2:3"])
-    assert refused.exit_code == 2
+    huddle("history", str(folder), "--since", "last week", code=2)
+    refused = huddle("history", str(folder), "--band", "2:3", code=2)
     assert "kept are 1:10" in " ".join(refused.stderr.split())

@@ -19,6 +19,7 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.result import Result
+from tests.command import huddle
 from tui.commands.main import app
 from tui.service.history.ledger import ledger_path, noise_of, noted, record_test, sensor_tests
 from tui.web.months import Months
@@ -100,8 +101,7 @@ def test_a_sensor_is_known_again_on_another_bench_by_its_serial_number(tmp_path:
 def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
     for day, bench in enumerate(["lab", "office"]):
         recorded_test(recorded(tmp_path, bench=bench, day=day))
-    told = CliRunner().invoke(app, ["history", "--sensor", "S2", "--band", "1:16", "--json", "-"])
-    assert told.exit_code == 0, told.output
+    told = huddle("history", "--sensor", "S2", "--band", "1:16", "--json", "-")
     series = json.loads(told.stdout)["series"]
     assert {(each["channel"], len(each["runs"])) for each in series} == {("X", 2), ("Y", 2)}
     assert [run["bench"] for run in series[0]["runs"]] == ["lab", "office"]
@@ -115,16 +115,14 @@ def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
     assert "1.1" in shown
     assert "21.0" in shown
     label = tmp_path / "S2.svg"
-    made = CliRunner().invoke(app, ["history", "--sensor", "S2", "--label", str(label)])
-    assert made.exit_code == 0, made.output
+    huddle("history", "--sensor", "S2", "--label", label)
     drawn = ET.parse(label)  # noqa: S314 - our own
     words = [each.text for each in drawn.iter("{http://www.w3.org/2000/svg}text")]
     assert words[:2] == ["S2", "2026-10-26, 1 to 16 Hz"]
     assert len(words) == 4  # two channels
-    unknown = CliRunner().invoke(app, ["history", "--sensor", "S9"])
-    assert unknown.exit_code == 2
+    unknown = huddle("history", "--sensor", "S9", code=2)
     assert "no test in the ledger" in unknown.output
-    assert CliRunner().invoke(app, ["history"]).exit_code == 2
+    huddle("history", code=2)
 
 
 def test_a_ledger_without_firmware_takes_further_tests(tmp_path: Path, ledger: Path) -> None:

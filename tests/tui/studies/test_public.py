@@ -16,6 +16,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.result import Result
+from tests.command import huddle
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 from tui.studies.public import BOUND, levels, model_free_bound
@@ -77,8 +78,7 @@ def test_a_folder_of_counts_without_responses(
     folder = tmp_path / "own"
     folder.mkdir()
     np.savez(folder / "a.npz", sampling_rate=RATE, **verticals(4, 1, 20_000)[0])  # type: ignore[arg-type]  # arrays
-    found = CliRunner().invoke(app, ["reproduce", "public", str(folder), "-o", str(tmp_path / "o")])
-    assert found.exit_code == 0
+    found = huddle("reproduce", "public", folder, "-o", str(tmp_path / "o"))
     assert "dB re 1 (counts)²/Hz" in found.stdout
     assert re.search(r"^0 of \d+ levels", found.stdout, re.MULTILINE)
 

@@ -7,12 +7,11 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 import pytest
-from typer.testing import CliRunner
 
 from daq.devices.bench_file import load
+from tests.command import huddle
 from tests.tui.web.conftest import SIZES, opened
 from tests.tui.web.pages import Server, bench_file, serving
-from tui.commands.main import app
 from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.store import RunStore
 
@@ -31,8 +30,7 @@ def server(folder: Path) -> Iterator[Server]:
     """Serve a bench with an archive and forty runs, after twenty of which a sensor is worse."""
     bench = bench_file(folder, '[web]\narchive = "store"\n')
     recording = folder / "recordings" / "night.h5"
-    made = CliRunner().invoke(app, ["archive", str(recording), "--store", str(folder / "store")])
-    assert made.exit_code == 0, made.output
+    huddle("archive", recording, "--store", str(folder / "store"))
     store = RunStore(folder / "recordings")
     for day in range(40):
         psd = 1e-9 * (1.0 if day < 20 else 2.0)

@@ -23,11 +23,10 @@ from daq.results.facts.model import ModelPasses
 from daq.results.facts.recordings import BlocksDamaged, SensorsSimulated
 from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
-from daq.results.sources import sources
 from estimator.checks.advice import Advice, Rank
 from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
 from tests.tui.night_recording import record
-from tests.tui.report.written_report import assert_as_kept
+from tests.tui.report.written_report import assert_as_kept, result_of
 from tests.tui.wording.advice_examples import MISFIT
 from tests.tui.wording.fact_examples import EXAMPLES, kinds
 from tui.application.result_view.result_text import result
@@ -145,16 +144,7 @@ def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.Mon
         "console": printed(*details(snapshot, Result(snapshot, Settings()).facts)),
         "application": printed(result(state_of(snapshot), width=160)),
         "report": " ".join(
-            str(
-                report_of(
-                    Result(
-                        snapshot,
-                        SETTINGS,
-                        sources([recorded])[0].bench,
-                        examined=tuple(sources([recorded])),
-                    )
-                )
-            ).split()
+            str(report_of(result_of(SETTINGS, recorded, snapshot=snapshot))).split()
         ),
         "notebook": " ".join(map(str, Result(snapshot, Settings()).facts)),
     }
