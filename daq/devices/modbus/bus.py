@@ -17,7 +17,7 @@ import logging
 import math
 import struct
 from collections import defaultdict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from pymodbus.client import AsyncModbusTcpClient
@@ -81,6 +81,25 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
+class _Request:
+    """To read registers from an address on, or to write one."""
+
+    device_id: int
+    function: int
+    address: int
+    value: int
+    """How many are read, or what is written."""
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        about, at = f"device {self.device_id}, function {self.function}", self.address
+        if self.function == rtu.WRITE_SINGLE:
+            return f"{about}, register {at} ({at:#06x}) ← {self.value}"
+        last = at + self.value - 1
+        return f"{about}, registers {at} to {last} ({at:#06x} to {last:#06x})"
+
+
+@dataclass(frozen=True, slots=True)
 class _Answer:
     """A received reply: registers or the code of an exception, and its arrival."""
 
@@ -99,14 +118,7 @@ class _Link(Protocol):
     """Whether a reply names its request."""
 
     async def ask(
-        self,
-        device_id: int,
-        function: int,
-        address: int,
-        value: int,
-        patience: float,
-        *,
-        late: Mapping[int, Collection[int]],
+        self, request: _Request, patience: float, *, late: Mapping[int, Collection[int]]
     ) -> _Answer:
         """Return the reply; ``late``: see :class:`ReplyFinder`."""
         ...
@@ -126,20 +138,14 @@ class _RtuLink:
         self._finder = ReplyFinder(echo=echo)
 
     async def ask(
-        self,
-        device_id: int,
-        function: int,
-        address: int,
-        value: int,
-        patience: float,
-        *,
-        late: Mapping[int, Collection[int]],
+        self, request: _Request, patience: float, *, late: Mapping[int, Collection[int]]
     ) -> _Answer:
         stream, finder = self._stream, self._finder
-        request = rtu.encode(device_id, struct.pack(">BHH", function, address, value))
+        content = struct.pack(">BHH", request.function, request.address, request.value)
+        frame = rtu.encode(request.device_id, content)
         stream.discard()
-        finder.expect(request, late=late)
-        await stream.write(request)
+        finder.expect(frame, late=late)
+        await stream.write(frame)
         loop = asyncio.get_running_loop()
         deadline = loop.time() + patience
         quiet = False
@@ -151,7 +157,7 @@ class _RtuLink:
                     received, at = await stream.read()
                 reply = finder.receive(received)
                 if reply is not None:
-                    is_read = reply.exception is None and function != rtu.WRITE_SINGLE
+                    is_read = reply.exception is None and request.function != rtu.WRITE_SINGLE
                     registers = reply.registers.tolist() if is_read else ()
                     return _Answer(registers, reply.exception, at)
                 if finder.is_damaged:
@@ -163,7 +169,7 @@ class _RtuLink:
             pass
         unexpected, other_unit = finder.unexpected, finder.other_unit
         finder.cancel()
-        if other_unit == device_id:
+        if other_unit == request.device_id:
             raise RemoteProtocolError(unexpected)
         if unexpected and other_unit is None:
             raise DamagedReplyError(unexpected)
@@ -185,14 +191,7 @@ class _TcpLink:
         client.ctx.trace_packet = self._trace  # otherwise pymodbus logs the packets
 
     async def ask(
-        self,
-        device_id: int,
-        function: int,
-        address: int,
-        value: int,
-        patience: float,
-        *,
-        late: Mapping[int, Collection[int]],
+        self, request: _Request, patience: float, *, late: Mapping[int, Collection[int]]
     ) -> _Answer:
         del late  # pymodbus compares the numbers
         client = self._client
@@ -201,7 +200,7 @@ class _TcpLink:
         task = asyncio.current_task()
         n_cancelled = task.cancelling() if task else 0
         try:
-            reply = await self._reply(device_id, function, address, value)
+            reply = await self._reply(request)
             received = self._clock.now()
             if task and task.cancelling() > n_cancelled:
                 # pymodbus uses wait_for, which before Python 3.12 returns a reply received in the
@@ -212,17 +211,17 @@ class _TcpLink:
         except ModbusIOException as error:
             if not client.connected:
                 raise NotConnectedError("the port closed") from error
-            raise NoAnswerError(self._unexpected(device_id)) from error
+            raise NoAnswerError(self._unexpected(request.device_id)) from error
         code = int(getattr(reply, "exception_code", 0)) if reply.isError() else None
         return _Answer(reply.registers, code, received)
 
-    async def _reply(self, device_id: int, function: int, address: int, value: int) -> ModbusPDU:
-        client = self._client
-        if function == rtu.WRITE_SINGLE:
-            return await client.write_register(address, value, device_id=device_id)
-        if function == rtu.READ_HOLDING:
-            return await client.read_holding_registers(address, count=value, device_id=device_id)
-        return await client.read_input_registers(address, count=value, device_id=device_id)
+    async def _reply(self, request: _Request) -> ModbusPDU:
+        client, address, unit = self._client, request.address, request.device_id
+        if request.function == rtu.WRITE_SINGLE:
+            return await client.write_register(address, request.value, device_id=unit)
+        if request.function == rtu.READ_HOLDING:
+            return await client.read_holding_registers(address, count=request.value, device_id=unit)
+        return await client.read_input_registers(address, count=request.value, device_id=unit)
 
     async def settle(self, seconds: float) -> None:
         """Do nothing: replies are numbered."""
@@ -323,35 +322,29 @@ class ModbusBus:
         NotConnectedError
             If the port is closed.
         """
-        await self._resynchronise(function, device_id, address, count)
-        return await self._read(function, device_id, address, count)
+        request = _Request(device_id, function, address, count)
+        await self._resynchronise(request)
+        return await self._read(request)
 
-    async def _read(self, function: int, device_id: int, address: int, count: int) -> Reply:
-        sent = self._clock.now()
-        answer = await self._exchange(
-            device_id,
-            function,
-            address,
-            count,
-            f"device {device_id}, function {function}, registers {address} to"
-            f" {address + count - 1} ({address:#06x} to {address + count - 1:#06x})",
-        )
+    async def _read(self, request: _Request) -> Reply:
+        sent, count = self._clock.now(), request.value
+        answer = await self._exchange(request)
         elapsed_ns = answer.received.monotonic_ns - sent.monotonic_ns
-        self._devices[device_id].replied(elapsed_ns * 1e-9 / self._clock.speed)
+        self._devices[request.device_id].replied(elapsed_ns * 1e-9 / self._clock.speed)
         if len(answer.registers) != count:
             raise RemoteProtocolError(f"{len(answer.registers)} registers; expected {count}")
         return Reply(answer.registers, sent, answer.received)
 
-    async def _resynchronise(self, function: int, device_id: int, address: int, count: int) -> None:
+    async def _resynchronise(self, request: _Request) -> None:
         """See that no reply to an earlier request of the device is late, or will be."""
-        device = self._devices[device_id]
+        device = self._devices[request.device_id]
         if not device.unanswered or self._link.numbers_requests:
             return
-        used = {count, *device.unanswered}
+        used = {request.value, *device.unanswered}
         other = next((n for n in range(1, MAX_REGISTERS + 1) if n not in used), None)
         if other is not None:
             try:
-                await self._read(function, device_id, address, other)
+                await self._read(replace(request, value=other))
             except RefusedError:  # of this request, or a late one of the requests before
                 if len(device.unanswered) > 1:
                     await self.settle(self._timeout)
@@ -361,23 +354,18 @@ class ModbusBus:
 
     async def write(self, device_id: int, address: int, value: int) -> None:
         """Write one register by function 6; raise the errors of :meth:`read`."""
-        text = f"device {device_id}, function 6, register {address} ({address:#06x}) ← {value}"
         try:
-            await self._exchange(device_id, rtu.WRITE_SINGLE, address, value, text)
+            await self._exchange(_Request(device_id, rtu.WRITE_SINGLE, address, value))
         except NoAnswerError:
             await self.settle(self._patience)
             raise
 
-    async def _exchange(
-        self, device_id: int, function: int, address: int, value: int, request: str
-    ) -> _Answer:
-        device = self._devices[device_id]
+    async def _exchange(self, request: _Request) -> _Answer:
+        device = self._devices[request.device_id]
         self._patience = self._timeout_for(device)
         late = {unit: one.unanswered for unit, one in self._devices.items() if one.unanswered}
         try:
-            answer = await self._link.ask(
-                device_id, function, address, value, self._patience, late=late
-            )
+            answer = await self._link.ask(request, self._patience, late=late)
         except NotConnectedError as error:
             raise NotConnectedError(f"{self.label}: the port closed") from error
         except DamagedReplyError as error:
@@ -385,8 +373,8 @@ class ModbusBus:
                 f"{self.label}: a damaged reply to {request}; {error}"
             ) from error
         except NoAnswerError as error:
-            if function != rtu.WRITE_SINGLE:
-                device.did_not_reply(value)
+            if request.function != rtu.WRITE_SINGLE:
+                device.did_not_reply(request.value)
             detail = f"; {error}" if str(error) else ""
             raise NoAnswerError(
                 f"{self.label}: no answer in {self._patience:.2g} s to {request}{detail}"
