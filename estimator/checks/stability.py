@@ -736,10 +736,11 @@ def _changed(
             total = total + band.responses
             continue
         unsteady = band.levels.statistic > critical_value(n_parts - 1, FALSE_ALARM)
-        level = np.ones(n_parts)
+        level, responses = np.ones(n_parts), band.responses
         if unsteady.any():
             level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
-        total = total + band.responses.weighted(level)
+            responses = responses.beside_noise(unsteady)
+        total = total + responses.weighted(level)
     total = total.centred()
     added = np.zeros(sum(dims))
     first = np.cumsum([0, *dims])

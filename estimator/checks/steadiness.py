@@ -207,6 +207,8 @@ class ResponseScores:
         self.of_sensor = [slice(low, high) for low, high in itertools.pairwise(squares)]
         n = len(pairs)
         self.score, self.information = np.zeros((n_parts, n)), np.zeros((n_parts, n, n))
+        self._by_noise, self._n_bins = np.zeros((n, edges[-1])), 0
+        self._averages, self._noise = np.zeros(n_parts), np.zeros((n_parts, edges[-1]))
         self.dims = dims
 
     def add(self, found: Regression, correlation: FloatArray) -> None:
@@ -220,6 +222,17 @@ class ResponseScores:
         PP = P[:, a[:, None], a] * (ratio[:, :, None] * ratio[:, None, :])
         # variance of the score, with neighbours correlated, over the independent one
         more = float(correlation.sum() / len(correlation))
+        UU = U @ U.conj().swapaxes(1, 2)
+        by_noise = ratio[:, :, None] * (P[:, a] * UU[:, :, b].swapaxes(1, 2)).real
+        self._by_noise += 2 / more * by_noise.sum(axis=0)
+        self._averages = found.averages + U.shape[2]
+        explained = (
+            ((found.coefficients @ found.motion) * found.coefficients.conj()).sum(axis=3).real
+        )
+        beside = np.einsum("kfpp->kfp", found.left).real - np.einsum("fpp->fp", P).real
+        excess = beside + explained / self._averages[:, None, None]
+        self._noise += (found.inverse @ excess[..., None])[..., 0].sum(axis=1)
+        self._n_bins += len(U)
         for k in range(len(self.score)):
             turned = M[k][:, b, :][:, :, b].swapaxes(1, 2)  # [f, (a,b), (c,e)] = M[e, b]
             information = np.einsum("fij,fij->ij", PP, turned).real
@@ -238,7 +251,21 @@ class ResponseScores:
         return found
 
     def __add__(self, other: ResponseScores) -> ResponseScores:
-        return self._like(self.score + other.score, self.information + other.information)
+        found = self._like(self.score + other.score, self.information + other.information)
+        found._by_noise, found._noise = self._by_noise + other._by_noise, self._noise + other._noise
+        found._averages, found._n_bins = self._averages, self._n_bins + other._n_bins
+        return found
+
+    def beside_noise(self, channels: BoolArray) -> ResponseScores:
+        """Return the scores without what noise of some channels adds that is not that of the fit.
+
+        It is ``n_k P N_k U``, zero where N_k is the unit matrix, and as much of the score as a
+        response that changes where motion is weak. The noise of a part is that of ``P S_k P``,
+        which is unbiased if no response changes.
+        """
+        noise = np.where(channels, self._noise / max(self._n_bins, 1), 0.0)
+        score = self.score - self._averages[:, None] * (noise @ self._by_noise.T)
+        return self._like(score, self.information)
 
     def weighted(self, level: FloatArray) -> ResponseScores:
         """Return the scores where the noise has `level` in each part, shape (n_parts,)."""
