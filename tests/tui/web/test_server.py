@@ -26,11 +26,20 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
 from daq.recording.reader import Recording
+from daq.results.result import Result
+from tests.daq.results.decision.benches import bench_with
+from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import HOSTILE
+from tests.tui.report.written_report import assert_as_kept, lines_of
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
 from tests.waiting import limit, wait_until
+from tui.application.state import Reference, State
 from tui.commands.main import app
+from tui.page.blocks import Items, Section
+from tui.page.table import Table
 from tui.web.access import token_hash
+from tui.web.chart import choice_of, picture
+from tui.web.pages import about_test
 
 SERVICE = """
 [[schedule]]
@@ -333,3 +342,24 @@ def test_a_service_keeps_its_pages_running(tmp_path: Path) -> None:
         service.terminate()
         service.wait(limit(60))
     assert not answers()
+
+
+def test_curves_and_words_of_a_test_are_as_kept() -> None:
+    """Beside another one with a limit that is not decided, at two choices of what is drawn."""
+    result = Result(diagnosed(n_effective=100.0), SETTINGS, bench_with(12e-12))
+    other = Reference(Path("other.h5"), Result(made_snapshot(), SETTINGS))
+    state = State("bench", result=result, reference=other)
+    lines = [
+        line
+        for asked in (dict[str, str](), {"channel": "4", "unit": "1", "from": "2", "to": "20"})
+        for line in picture(state, choice_of(state, asked)).splitlines()
+    ]
+    about = about_test(state, {"segment": 2.0})
+    section = Section(
+        "", tuple(each for each in about.values() if isinstance(each, (Table, Items)))
+    )
+    words = (
+        f"{name}: {each}" for name, each in about.items() if isinstance(each, (str, tuple, list))
+    )
+    kept = Path(__file__).parent / "curves.txt"
+    assert_as_kept([*lines, *words, *lines_of([section])], kept)
