@@ -126,10 +126,10 @@ def _fits(secret: str, given: str) -> bool:
     return hmac.compare_digest(_scrypt(given, salt), wanted)
 
 
-def _resolved(secret: str | None, environment: Mapping[str, str]) -> str | None:
+def _resolved(secret: str | None) -> str | None:
     if secret is None or not secret.startswith("${"):
         return secret
-    token = environment.get(secret[2:-1], "")
+    token = os.environ.get(secret[2:-1], "")
     if len(token) < SHORTEST_TOKEN:
         raise AccessError(
             f"web: the variable {secret} of the environment has {len(token)} characters; expected a"
@@ -287,8 +287,6 @@ class Access:
         Known to the server alone.
     ended : Ended
         Visits that are over.
-    environment : mapping, optional
-        Of the process, if not given.
     now : callable
         UTC in s since 1970.
 
@@ -304,15 +302,13 @@ class Access:
         key: bytes,
         ended: Ended,
         *,
-        environment: Mapping[str, str] | None = None,
         now: Callable[[], float] = time.time,
     ) -> None:
-        environment = os.environ if environment is None else environment
         found = {Right.STEER: web.steer, Right.READ: web.read}
         self._secrets = {
             right: secret
             for right, line in found.items()
-            if (secret := _resolved(line, environment)) is not None
+            if (secret := _resolved(line)) is not None
         }
         self._key, self._ended, self._now = key, ended, now
         self._attempts = _Attempts(now)

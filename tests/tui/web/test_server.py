@@ -25,6 +25,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
+from daq.bench.tables.unattended import Web
 from daq.recording.reader import Recording
 from daq.results.result import Result
 from tests.daq.results.decision.benches import bench_with
@@ -37,7 +38,7 @@ from tui.application.state import Reference, State
 from tui.commands.main import app
 from tui.page.blocks import Items, Section
 from tui.page.table import Table
-from tui.web.access import token_hash
+from tui.web.access import SHORTEST_TOKEN, Access, AccessError, Ended, token_hash
 from tui.web.chart import choice_of, picture
 from tui.web.pages import about_test
 
@@ -287,6 +288,19 @@ def test_programs_send_a_token(closed: Server) -> None:
     found = closed.visit().get("/tests/night.h5/result.json", Authorization=f"Bearer {READER}")
     assert json.loads(found.content)["verdict"] == "not-decided"
     assert closed.visit().get("/tests", Authorization=f"Bearer {STEERER}").status == 401
+
+
+def test_a_token_may_be_in_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    web, ended = Web(read="${HUDDLE_TOKEN_OF_A_TEST}"), Ended(tmp_path / "ended")
+    token = "t" * SHORTEST_TOKEN
+    monkeypatch.setenv("HUDDLE_TOKEN_OF_A_TEST", token)
+    access = Access(web, b"key", ended)
+    assert not access.is_open
+    assert access.by_token("192.0.2.1", token) is not None
+    assert access.by_token("192.0.2.1", token[1:]) is None
+    monkeypatch.setenv("HUDDLE_TOKEN_OF_A_TEST", token[1:])
+    with pytest.raises(AccessError, match="expected a token of at least"):
+        Access(web, b"key", ended)
 
 
 def test_a_visit_lasts_over_a_restart_and_ends_with_the_secret(tmp_path: Path) -> None:
