@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -170,5 +171,7 @@ def test_segments_with_transients_are_marked_where_they_are(octaves: bool) -> No
     assert max(mark.end for mark in rejected) - begin >= 305
     if not octaves:
         assert all(295 < mark.begin - begin < mark.end - begin < 310 for mark in rejected)
+    later = signal.excluded(replace(snapshot, start_utc_ns=snapshot.start_utc_ns + 10**12))
+    assert [mark.begin for mark in later] == pytest.approx([m.begin + 1000 for m in marks[1:]])
     found = signal.view(*signal.span, 600, marks).marks
     assert sum(mark.count for mark in found if mark.kind == EXCLUDED) == 1 + len(snapshot.rejected)

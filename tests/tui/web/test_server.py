@@ -34,13 +34,14 @@ from tests.tui.night_recording import HOSTILE
 from tests.tui.report.written_report import assert_as_kept, lines_of
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, Visit, bench_file, serving
 from tests.waiting import limit, wait_until
-from tui.application.state import Reference, State
+from tui.application.state import State
 from tui.commands.main import app
 from tui.page.blocks import Items, Section
 from tui.page.table import Table
 from tui.web.access import SHORTEST_TOKEN, Access, AccessError, Ended, token_hash
 from tui.web.chart import choice_of, picture
 from tui.web.pages import about_test
+from tui.web.tests import compared
 
 SERVICE = """
 [[schedule]]
@@ -361,8 +362,8 @@ def test_a_service_keeps_its_pages_running(tmp_path: Path) -> None:
 def test_curves_and_words_of_a_test_are_as_kept() -> None:
     """Beside another one with a limit that is not decided, at two choices of what is drawn."""
     result = Result(diagnosed(n_effective=100.0), SETTINGS, bench_with(12e-12))
-    other = Reference(Path("other.h5"), Result(made_snapshot(), SETTINGS))
-    state = State("bench", result=result, reference=other)
+    other = Result(made_snapshot(), SETTINGS, recordings=(Path("other.h5"),))
+    state = compared(State("bench", result=result), State("other", result=other))
     lines = [
         line
         for asked in (dict[str, str](), {"channel": "4", "unit": "1", "from": "2", "to": "20"})
