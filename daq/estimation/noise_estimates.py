@@ -527,6 +527,7 @@ def noise_estimates(
     shared: Sequence[tuple[int, int]] = (),
     chosen: bool = False,
     stability: Stability | None = None,
+    before: tuple[Mapping[str, SelfNoise], Stability | None] | None = None,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -552,9 +553,12 @@ def noise_estimates(
         three-sensor is the paper's formula.
     stability : Stability, optional
         Of these averages: where noise changes, fewer averages tell it from motion.
+    before : mapping of str to SelfNoise, with the stability that these rest on, optional
+        Results of the only band, else alike: they stay where the inflation does.
     """
     chosen, known = chosen or "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
+    inflations = [_inflation(band, stability) for band in bands]
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
     changing: MultiPart | None = None
@@ -584,6 +588,12 @@ def noise_estimates(
                     options = [option | {"maxima": maxima} for option in options]
                 engine = chosen or method == "maximum-likelihood"
                 given: Sequence[SelfNoise | None] = known.get(method, ()) or [None] * len(bands)
+                blocks = [blocks_of(band.frequencies) if engine else None for band in bands]
+                if before is not None and method in before[0]:
+                    given = [before[0][method]]
+                    changed = inflations[0] != _inflation(bands[0], before[1])
+                    if (of := blocks[0]) is not None:
+                        blocks = [np.where(np.isin(of, of[changed]), of, -1)]
                 parts = [
                     self_noise(
                         method,
@@ -592,15 +602,15 @@ def noise_estimates(
                         n_effective=band.n_effective,
                         correct=settings.correct,
                         real=band.settings.real(band.frequencies),
-                        blocks=blocks_of(band.frequencies) if engine else None,
+                        blocks=of,
                         correlation=_power_correlation(band),
-                        known=before,
-                        inflation=1.0
-                        if stability is None
-                        else stability.inflation_at(band.frequencies),
+                        known=itself,
+                        inflation=inflation,
                         **option,
                     )
-                    for band, option, before in zip(bands, options, given, strict=True)
+                    for band, option, itself, of, inflation in zip(
+                        bands, options, given, blocks, inflations, strict=True
+                    )
                 ]
                 if method == "maximum-likelihood" and dimensions is not None:
                     parts = _by_gradients(parts, bands, dimensions, dims)
@@ -611,6 +621,13 @@ def noise_estimates(
             else:
                 results[method] = joined(parts)
     return Estimates(results, refused, dimensions, changing)
+
+
+def _inflation(band: Band, stability: Stability | None) -> FloatArray:
+    """Return the variance of averages over that of steady noise, shape (n_freqs,)."""
+    if stability is None:
+        return np.ones(len(band.frequencies))
+    return stability.inflation_at(band.frequencies)
 
 
 def _by_changes(

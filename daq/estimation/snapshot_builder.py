@@ -73,7 +73,7 @@ from daq.estimation.throttle import Throttle
 from daq.protocols.block import Event, Quantity, Reading
 from daq.recording.interface import ReadableRecording
 from estimator.checks.advice import Untested
-from estimator.checks.stability import SegmentCourse
+from estimator.checks.stability import SegmentCourse, Stability
 from estimator.checks.steadied import Steadied
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
@@ -389,8 +389,12 @@ class SnapshotBuilder:
         )
         if self._dimensions is estimates.dimensions and not changes:
             return estimates
-        n = bands[-1].n_segments
-        return self._estimates(bands, raw, recording, first, n, maxima=maxima, final=False)
+        n, before = bands[-1].n_segments, None
+        if self._dimensions is estimates.dimensions and len(bands) == 1:
+            before = estimates.results, self._stability_known
+        return self._estimates(
+            bands, raw, recording, first, n, maxima=maxima, final=False, before=before
+        )
 
     def _within_parts(
         self,
@@ -494,6 +498,7 @@ class SnapshotBuilder:
         *,
         maxima: Maxima,
         final: bool,
+        before: tuple[Mapping[str, SelfNoise], Stability | None] | None = None,
     ) -> Estimates:
         """Estimate; while following, the dimension of the motion is the one chosen before."""
         if not bands:
@@ -516,6 +521,7 @@ class SnapshotBuilder:
                 maxima=maxima,
                 shared=self._pairs,
                 stability=self._stability_known,
+                before=before,
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments

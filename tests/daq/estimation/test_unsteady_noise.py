@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import huddle
+from daq.estimation import snapshot_builder
+from daq.estimation.noise_estimates import Estimates, noise_estimates
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
@@ -63,6 +67,38 @@ def test_gusts_beside_weak_motion_are_noise_that_changes(n_sensors: int) -> None
     low, high = noise.low[5:72], noise.high[5:72]
     assert np.mean((low <= truth) & (truth <= high)) > 0.9
     assert NoiseChanges in [type(each) for each in found.diagnostics.advice]
+
+
+def test_levels_of_bands_whose_noise_is_steady_are_estimated_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(8)
+    level = np.exp(rng.standard_normal(N // 200)).repeat(200)[:, None]  # of 5 s each
+    motion = 3 * rng.standard_normal((N, 3))
+    samples = {}
+    for name in "ABC":
+        fast = np.diff(level * rng.standard_normal((N, 3)), n=3, axis=0, prepend=np.zeros((3, 3)))
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        samples[name] = motion @ turn + rng.standard_normal((N, 3)) + fast / 5
+    once = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    stability = once.diagnostics.diagnosis.stability if once.diagnostics.diagnosis else None
+    assert stability is not None
+    assert stability.inflations.min() == 1 < stability.inflations.max()
+
+    def of_all(*given: Any, before: object = None, **options: Any) -> Estimates:  # noqa: ANN401
+        assert before is not None or "again" not in passes
+        passes.append("again")
+        return noise_estimates(*given, **options)
+
+    passes: list[str] = []
+    monkeypatch.setattr(snapshot_builder, "noise_estimates", of_all)
+    twice = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    assert len(passes) == 2
+    # blocks that are fitted together take as many rounds, to weights within 3 %
+    for name, found in once.results.items():
+        expected = twice.results[name]
+        np.testing.assert_allclose(found.noise_psd, expected.noise_psd, rtol=1e-3)
+        np.testing.assert_allclose(found.cumulants, expected.cumulants, rtol=1e-2)
 
 
 @pytest.mark.long
