@@ -66,7 +66,7 @@ def result_section(
     if is_stated and table is not None:
         texts.insert(0, decision_rule(table, statements[0].k))
     parts: list[Part] = [
-        _result_table(result, statements, is_stated=is_stated),
+        *_result_tables(result, statements, is_stated=is_stated),
         *(Paragraph(text) for text in texts if text),
         *noise_plots(result, models),
     ]
@@ -90,18 +90,22 @@ def result_section(
     return Section("Result", (*parts, Paragraph(" ".join(notes), "quiet")))
 
 
-def _result_table(result: Result, statements: Sequence[Conformity], *, is_stated: bool) -> Table:
-    """Return a row for each channel, or for each of its limits, and those without one last."""
-    snapshot, found = result.snapshot, result.verdict
-    limits = () if found is None else found.limits
+def _result_tables(
+    result: Result, statements: Sequence[Conformity], *, is_stated: bool
+) -> list[Table]:
+    """Return noise and limit of each channel, the worst sensor first.
+
+    Two tables where one is too wide: with several limits, or statements of conformity.
+    """
+    snapshot = result.snapshot
+    limits = () if result.verdict is None else result.verdict.limits
     order = list(dict.fromkeys(each.limit for each in limits))
     by_rule = {(each.limit, each.sensor, each.channel): each for each in statements}
-    noise = dict(zip((each.name for each in snapshot.channels), _noise(result), strict=True))
-    rows: list[tuple[str, ...]] = []
     worst = {each.sensor: len(WORST_FIRST) for each in limits}
     for each in limits:  # channels of a sensor stay together
         worst[each.sensor] = min(worst[each.sensor], WORST_FIRST.index(each.verdict))
     by_sensor = list(worst)
+    judged: list[tuple[str, ...]] = []
     for each in sorted(
         limits,
         key=lambda e: (
@@ -122,25 +126,33 @@ def _result_table(result: Result, statements: Sequence[Conformity], *, is_stated
         if by_rule:
             stated = by_rule[each.limit, each.sensor, each.channel]
             cells += (STATEMENTS[stated.statement],) * is_stated + (_risk(stated.risk),)
-        rows.append((each.name, *noise.pop(each.name, [""] * NOISE_COLUMNS), *cells))
-    header = [
-        "channel", "recorded (dB)", "self-noise (dB)", f"({snapshot.unit})/√Hz", "SNR (dB)",
+        judged.append((each.name, *cells))
+    limit = [
+        *["limit"] * (len(order) > 1), "at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)",
+        "verdict", *["conformity"] * is_stated, *["risk"] * bool(by_rule),
     ]  # fmt: skip
-    if limits:
-        header += ["limit"] * (len(order) > 1)
-        header += ["at (Hz)", "noise (dB)", "limit (dB)", "margin (dB)", "verdict"]
-        header += (["conformity"] if is_stated else []) + ["risk"] * bool(by_rule)
-    rows += [
-        (name, *cells, *[""] * (len(header) - 1 - NOISE_COLUMNS)) for name, cells in noise.items()
-    ]
-    title = f"Mean over {span(*result.band)}" if snapshot.results else "Limits"
-    title += f" by the {result.method} method" if snapshot.results else ""
-    title += f", dB re 1 ({snapshot.unit})²/Hz"
-    if len(order) == 1:
-        title += f"; limit: {order[0]}"
+    noise = dict(zip((each.name for each in snapshot.channels), _noise(result), strict=True))
+    columns = ["recorded (dB)", "self-noise (dB)", f"({snapshot.unit})/√Hz", "SNR (dB)"]
+    mean = f"Mean over {span(*result.band)}"
+    mean += f" by the {result.method} method" if snapshot.results else ""
+    unit, of = f"dB re 1 ({snapshot.unit})²/Hz", f": {order[0]}" if len(order) == 1 else "s"
+    own = [(name, *cells) for name, cells in noise.items()]
+    if not limits:
+        return [_table(columns, own, f"{mean}, {unit}")]
+    if len(order) > 1 or is_stated:
+        return [
+            _table(limit, judged, f"Limit{of}, {unit}"), _table(columns, own, f"{mean}, {unit}"),
+        ]  # fmt: skip
+    nothing = ("",) * len(limit)
+    rows = [(name, *noise.pop(name, ("?",) * len(columns)), *cells) for name, *cells in judged]
+    rows += [(name, *cells, *nothing) for name, cells in noise.items()]
+    return [_table([*columns, *limit], rows, f"{mean}, {unit}; limit{of}")]
+
+
+def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]], title: str) -> Table:
     words = {"channel", "limit", "verdict", "conformity"}
-    left = frozenset(n for n, name in enumerate(header) if name in words)
-    return Table(tuple(header), tuple(rows), left=left, title=title)
+    left = frozenset(n for n, name in enumerate(("channel", *columns)) if name in words)
+    return Table(("channel", *columns), tuple(rows), left=left, title=title)
 
 
 def _noise(result: Result) -> list[tuple[str, ...]]:

@@ -114,6 +114,22 @@ def test_limits_are_judged_with_their_margin(reported: Reported, tmp_path: Path)
     assert "FAIL" in (tmp_path / "n.html").read_text(encoding="utf-8")
 
 
+def test_several_limits_have_a_table_beside_that_of_the_noise(reported: Reported) -> None:
+    """One table of both was so wide that words were broken."""
+    result = reported.result
+    assert result.bench is not None
+    (limit,) = result.bench.limits
+    more = result.bench.model_copy(
+        update={"limits": (limit, limit.model_copy(update={"name": "b"}))}
+    )
+    section = result_section(replace(result, bench=more))
+    limits, noise = (part for part in section.parts if isinstance(part, Table))
+    assert limits.header[:2] == ("channel", "limit")
+    assert [row[1] for row in limits.rows] == ["data sheet"] * 8 + ["b"] * 8
+    assert noise.header[:3] == ("channel", "recorded (dB)", "self-noise (dB)")
+    assert [row[0] for row in noise.rows] == [each.name for each in result.snapshot.channels]
+
+
 def test_by_all_methods_it_is_the_one_that_needs_no_alignment_that_judges(
     reported: Reported,
 ) -> None:
