@@ -12,7 +12,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank, Untested, model
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
-from estimator.checks.advice_on_signals import NoSharedMotion, TooFewSensors
+from estimator.checks.advice_on_signals import NoSharedMotion, NoSignal, TooFewSensors
 from estimator.likelihood.dimension import BandDimension
 from estimator.records import Hertz, Share, record
 from estimator.wording import Words, listed, percent, span
@@ -280,7 +280,11 @@ def facts_of_model(snapshot: Snapshot) -> Iterator[Fact]:
         and not any(each.pairs for each in choices)
         and all(clock.is_understood for clock in snapshot.clocks)
     ):
-        yield ModelPasses(rank=Rank.TO_KNOW, n_factors=found.n_factors, dims=snapshot.dims)
+        dead = [each.channels for each in found.advice if isinstance(each, NoSignal)]
+        sensor = np.repeat(np.arange(len(snapshot.dims)), snapshot.dims)
+        live = np.bincount(np.delete(sensor, [column for each in dead for column in each]))
+        dims = tuple(live[live > 0].tolist())
+        yield ModelPasses(rank=Rank.TO_KNOW, n_factors=found.n_factors, dims=dims)
     if not choices:
         return
     yield from _shared_by_two(snapshot)

@@ -116,3 +116,15 @@ def test_noise_that_all_sensors_share_is_in_the_intervals(n_sensors: int) -> Non
     for each in (each for band in BANDS for each in result.means(result.method, band)):
         assert np.isneginf(each.low[0])
         assert true < each.high[0] < 4 * true
+
+
+def test_of_three_sensors_beside_a_dead_one_two_may_share_noise() -> None:
+    """Of what the model assumes: its test has one degree of freedom then."""
+    rng = np.random.default_rng(1)
+    motion = 3 * rng.standard_normal((6000, 1))
+    samples = {name: motion + rng.standard_normal((6000, 1)) for name in "abc"}
+    samples["d"] = np.zeros((6000, 1))
+    settings = Settings(segment=1.0)
+    result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    (passes,) = (str(each) for each in result.facts if each.name == "model-passes")
+    assert passes.endswith("no noise that all or two of these three sensors share.")
