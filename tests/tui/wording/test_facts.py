@@ -20,7 +20,7 @@ from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import MethodRefused
 from daq.results.facts.model import ModelPasses
-from daq.results.facts.recordings import BlocksDamaged, SensorsSimulated
+from daq.results.facts.recordings import _OF_CAVEATS, BlocksDamaged, SensorsSimulated
 from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
 from estimator.checks.advice import Advice, Rank
@@ -55,6 +55,7 @@ def test_every_kind_has_one_maker() -> None:
     ]
     advice = {kind.__name__ for kind in kinds(Advice)}
     made = [each for each in made if each not in advice]
+    made += [kind.__name__ for kind in _OF_CAVEATS.values()]
     assert set(made) == {kind.__name__ for kind in kinds()}
     assert {kind for kind in made if made.count(kind) > 1} == {"ChannelsStuck"}  # now, and earlier
 
