@@ -120,7 +120,7 @@ class Outcome:
             )
             notes, parts = tuple(found.pop("notes")), tuple(found.pop("parts"))
             known = tuple((part, run, root) for part, run, root in found.pop("identities"))
-            found["caveats"] = Caveats(map(Caveat, found["caveats"]))
+            found["caveats"] = Caveats(map(Caveat, found.get("caveats", ())))
             return cls(noise=noise, notes=notes, parts=parts, identities=known, **found)
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"no outcome: {error}") from None
