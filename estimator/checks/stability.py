@@ -37,7 +37,7 @@ from estimator.checks.steadiness import (
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum, maximise
 from estimator.likelihood.goodness_of_fit import critical_value
-from estimator.likelihood.score_test import are_resolved, usable
+from estimator.likelihood.score_test import usable
 from estimator.median import median
 from estimator.records import NOT_IN_JSON, dataclass
 from estimator.spectra.parts import Parts, grouped
@@ -81,9 +81,13 @@ ADDED = 0.05
 """Share of the noise that changes of responses add, from which a band shows them."""
 BEYOND_GUSTS = 5.0
 """Motion and noise over noise, to which noise that changes does not come by scatter."""
-LEAST_USABLE = 0.5
-"""Share of the frequencies of a band that show the directions of the motion: with fewer, their mean
-does."""
+LEAKS = 0.85
+"""Coherency of two channels, from which a response that varies over a band leaves motion beside its
+mean."""
+WEAK = 0.4
+"""The same, below which motion is no matter where noise is tested."""
+CONFIRMED = 0.5
+"""Power of a direction at other frequencies, over the least of both, if it is of motion."""
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
@@ -382,11 +386,10 @@ def stability(
     bands = []
     for inside in insides:
         some, whole = (each[inside[parts.bins[each]]] for each in (places, every))
-        if doubtful or _is_beyond_gusts(maximum.take(parts.bins[whole])):
-            bands.append(of_band(maximum, some))
+        if not doubtful and _is_weak(maximum.take(parts.bins[whole])):
+            bands.append(_of_weak_motion(of_band, parts, maximum, whole, psd))
         else:
-            at = parts, whole
-            bands.append(_of_weak_motion(of_band, at, maximum, psd=psd, n_effective=n_effective))
+            bands.append(of_band(maximum, some))
     found = [band for band in bands if band is not None]
     if doubtful:
         bands = [None if band is None else replace(band, levels=None) for band in bands]
@@ -460,12 +463,8 @@ def _tested(maximum: Maximum, bins: IntArray, n_effective: float) -> tuple[BoolA
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Band:
-    """What the parts show of one band; `levels` are None where they are too uncertain.
+    """What the parts show of one band; `levels` are None where they are too uncertain."""
 
-    `worth` is the number of its frequencies that are independent.
-    """
-
-    worth: float
     explained: _Explained
     levels: PartLevels | None
     of_runs: PartLevels | None
@@ -492,6 +491,15 @@ class _Band:
         )
 
     @property
+    def is_unsteady(self) -> bool:
+        """Whether the noise of a channel changes."""
+        if self.levels is None:
+            return False
+        alarm = FALSE_ALARM / (LONG_TAILS * self.levels.level.shape[1])
+        most = critical_value(len(self.levels.level) - 1, alarm)
+        return bool((self.levels.statistic > most).any())
+
+    @property
     def inflation(self) -> float:
         """Variance of the scores of pairs over that for steady noise; 1 where it is not known."""
         return 1.0 if self.levels is None else self.scores.inflation(self.levels)
@@ -504,48 +512,50 @@ class _Band:
         return replace(self, levels=levels, scores=self.scores.of_parts(some))
 
 
-def _is_beyond_gusts(maximum: Maximum) -> bool:
-    """Return whether the motion of a band is stronger than noise that changes ever seems."""
-    last = maximum.eigenvalues[:, maximum.n_factors - 1 : maximum.n_factors]
-    return not len(last) or bool(median(np.ravel(last)) > BEYOND_GUSTS)
+def _is_weak(maximum: Maximum) -> bool:
+    """Return whether noise that changes may seem to be directions of the motion of a band."""
+    strength = maximum.eigenvalues[~maximum.boundary.any(axis=1), maximum.n_factors - 1]
+    return not len(strength) or bool(median(strength) < BEYOND_GUSTS)
 
 
 def _of_weak_motion(
     of_band: Callable[..., _Band | None],
-    at: tuple[Parts, IntArray],
+    parts: Parts,
     maximum: Maximum,
-    *,
+    places: IntArray,
     psd: FloatArray,
-    n_effective: float,
 ) -> _Band | None:
     """Return what the parts show of a band whose noise may look like motion where it changes.
 
-    If few frequencies show directions of the motion beside that, these are those of their mean, as
-    many as it shows. None where it shows motion that a fit does not explain.
+    Directions of the motion are those of the mean of the frequencies, as many as each half of these
+    shows and the other confirms: the scatter of noise differs between frequencies.
     """
-    parts, places = at
     bins = parts.bins[places]
     if len(places) < FREQUENCIES // 2 or (psd[bins] <= 0).any():
         return None
     (whole,) = parts.joined(places, [np.arange(len(parts.each))]).csm
     root = np.sqrt(psd[bins])
-    mean = (whole / root[:, :, None] / root[:, None, :]).mean(axis=0, keepdims=True)
-    still = of_band(maximise(mean, 0), places, is_weak=True)
-    if still is None:
+    whole = whole / root[:, :, None] / root[:, None, :]
+    halves = [some.mean(axis=0) for some in np.array_split(whole, 2)]  # neighbours are correlated
+    both = whole.mean(axis=0, keepdims=True)
+    shared = np.abs(both[0] - np.eye(both.shape[1])).max()
+    q = maximum.n_factors
+    found_in = [np.linalg.eigh(half) for half in halves]
+    least = np.minimum(found_in[0][0], found_in[1][0]) - 1
+    for (_, u), other in zip(found_in, halves[::-1], strict=True):
+        again = np.einsum("pa,pq,qa->a", u.conj(), other, u).real
+        confirmed = (again - 1 > CONFIRMED * least) & (least > 0)
+        q = int(np.cumprod(confirmed[::-1][:q]).sum())
+    found = maximise(both, q)
+    if found.boundary.any() and shared < WEAK:  # by scatter
+        found = maximise(both, 0)
+    if shared > LEAKS or not found.converged[0] or found.boundary.any():
         return None
-    averages = n_effective / still.inflation
-    some = places[usable(maximum, averages)[bins]]
-    if len(some) >= LEAST_USABLE * len(places):
-        return of_band(maximum, some)
-    averages *= still.worth
-    for q in range(maximum.n_factors, -1, -1):
-        found = maximise(mean, q)
-        if usable(found, averages)[0]:
-            further = np.asarray(np.linalg.eigvalsh(found.rest)[:, -1], np.float64)
-            if are_resolved(further, mean.shape[1], averages)[0]:
-                return None
-            return of_band(found, places, is_weak=True) if q else still
-    return None
+    band = of_band(found, places, is_weak=True)
+    if found.n_factors and band is not None and band.is_unsteady:  # its scatter may be in these
+        still = of_band(maximise(both, 0), places, is_weak=True)
+        return band if still is None else replace(band, scores=still.scores)
+    return band
 
 
 def _band(
@@ -610,7 +620,6 @@ def _band(
     power, scatter = power.sum(axis=0) / total, more * q * noise.sum(axis=0) / total
     n_alike = noise.sum(axis=0) ** 2 / np.maximum((noise**2).sum(axis=0), np.finfo(np.float64).tiny)
     return _Band(
-        len(places) ** 2 / spread,
         _Explained(
             power=power,
             scatter=scatter,

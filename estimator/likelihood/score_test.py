@@ -144,24 +144,15 @@ def _kept(
 def usable(maximum: Maximum, n_effective: float) -> BoolArray:
     """Return whether the residuals of each frequency can be tested, shape (n_freqs,).
 
-    The averages must determine the directions of the motion.
+    The averages must determine the directions of the motion: a factor of strength s, in units of
+    the noise, has the error ``(1 + s) / (n s**2)`` in every direction without motion.
     """
     good = maximum.converged & ~maximum.singular & ~maximum.boundary.any(axis=1)
     p, q = maximum.psi.shape[1], maximum.n_factors
     if q:
-        good &= are_resolved(maximum.eigenvalues[:, q - 1], p, n_effective)
+        strength = np.maximum(maximum.eigenvalues[:, q - 1] - 1, 1e-9)
+        good &= p * (1 + strength) < RESOLVED * n_effective * strength**2
     return np.asarray(good)
-
-
-def are_resolved(eigenvalues: FloatArray, n_channels: int, n_effective: float) -> BoolArray:
-    """Return whether averages determine directions of these eigenvalues of whitened matrices.
-
-    A factor of strength s, in units of the noise, has the error ``(1 + s) / (n s**2)`` in every
-    direction without motion.
-    """
-    strength = np.maximum(eigenvalues - 1, 1e-9)
-    most = RESOLVED * n_effective * strength**2
-    return np.asarray(n_channels * (1 + strength) < most)
 
 
 def pair_scores(
