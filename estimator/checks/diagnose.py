@@ -271,7 +271,7 @@ def diagnose(
     condition = np.full((len(csm), len(pairs)), np.nan)
     for one, two in combinations(range(len(there.sensors)), 2):
         pair = pairs.index((there.sensors[one], there.sensors[two]))
-        condition[given.valid, pair] = _condition(part.matrix[given.valid], there.dims, one, two)
+        condition[:, pair] = _condition(part.matrix, there.dims, one, two, given.valid)
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     maxima = maxima or Maxima()
@@ -436,15 +436,22 @@ def _least(values: FloatArray) -> FloatArray:
     return np.where(np.isnan(values).all(axis=1), np.nan, least)
 
 
-def _condition(matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int) -> FloatArray:
-    """Return the condition number of the coherency between two sensors, shape (n_freqs,)."""
+def _condition(
+    matrix: ComplexArray, dims: tuple[int, ...], j: int, k: int, valid: BoolArray
+) -> FloatArray:
+    """Return the condition number of the coherency between two sensors, shape (n_freqs,).
+
+    NaN where it is not `valid`.
+    """
     a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
+    between = matrix[:, a, b][valid]
     if min(dims[j], dims[k]) == 1:  # of one singular value, the norm
-        singular = np.linalg.norm(matrix[:, a, b], axis=(1, 2))[:, None]
+        singular = np.linalg.norm(between, axis=(1, 2))[:, None]
     else:
-        singular = np.linalg.svd(matrix[:, a, b], compute_uv=False)
-    least = singular[:, -1]
-    return np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+        singular = np.linalg.svd(between, compute_uv=False)
+    least, found = singular[:, -1], np.full(len(matrix), np.nan)
+    found[valid] = np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+    return found
 
 
 def _fit(
