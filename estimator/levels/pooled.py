@@ -121,7 +121,7 @@ class _Parts:
     ``bins`` are those of the blocks, ``start`` the first of each sub-block among these, and
     ``count`` their number. ``block`` has the block of each sub-block, ``first`` the first sub-block
     of each block; ``share`` is the weight of a sub-block in its block, ``averages`` what it is
-    worth, ``whole`` what its block is worth.
+    worth. ``whole`` is what its block is worth where noise changes, by which it is ``fewer``.
     """
 
     bins: IntArray
@@ -132,6 +132,7 @@ class _Parts:
     share: FloatArray
     averages: FloatArray
     whole: FloatArray
+    fewer: FloatArray
 
     def mean(self, values: _Array) -> _Array:
         """Return the weighted mean over the sub-blocks of each block."""
@@ -336,8 +337,9 @@ def _parts(
         block=block,
         first=first,
         share=count / sizes[block],
-        averages=worth_of[count] / fewer[block],
+        averages=worth_of[count],
         whole=worth_of[sizes] / fewer,
+        fewer=fewer,
     )
 
 
@@ -530,7 +532,7 @@ def _n_resolved(X: ComplexArray, parts: _Parts, q: IntArray, sensor: IntArray) -
     number = np.diff(parts.first, append=len(parts.block))
     at = (np.arange(min(SAMPLED, int(number.max()))) + 0.5) / min(SAMPLED, int(number.max()))
     sample = parts.first[:, None] + np.floor(at * number[:, None]).astype(np.int64)
-    return _stand_out(X[sample], parts.averages[parts.first], q, sensor)
+    return _stand_out(X[sample], parts.averages[parts.first] / parts.fewer, q, sensor)
 
 
 def _stand_out(
