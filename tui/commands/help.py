@@ -185,6 +185,9 @@ class _Converter:
         several = param.multiple or param.nargs == -1
         if value is None:
             return () if several else None
+        for each in (value,) if isinstance(value, str) else value if several else ():
+            if any(each in other.opts for other in ctx.command.params):
+                raise typer.BadParameter(f"{each} is an option; a value is missing", ctx, param)
         if self._type is not None and type(value) is self._type:
             return value  # a default, or whether a flag is there
         if self._plain is not None and isinstance(value, str):

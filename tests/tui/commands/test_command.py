@@ -335,6 +335,7 @@ def test_usage_is_exit_2(tmp_path: Path) -> None:
         ("estimate", "x.h5", "--overlap", "3"),
         ("estimate", "x.h5", "--method", "magic"),
         ("estimate", "x.h5", "--segment", "soon"),
+        ("estimate", "x.h5", "--json", "--details"),
         ("fly",),
     ):
         printed(*arguments, code=2)
