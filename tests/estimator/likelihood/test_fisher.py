@@ -97,7 +97,8 @@ def test_cumulants_are_traces_of_powers(*, with_penalty: bool) -> None:
         for m in range(3):
             trace = np.trace(np.linalg.matrix_power(K, m + 2)).real
             expected = trace * found.psi[1, i] ** (m + 2) / 148.0 ** (m + 1)
-            assert cumulants[m, 1, i] == pytest.approx(expected, rel=1e-9)
+            # Of many sensors small terms are left out, and one has single precision.
+            assert cumulants[m, 1, i] == pytest.approx(expected, rel=1e-6)
 
 
 def test_eigenvalues_are_corrected_for_scatter() -> None:

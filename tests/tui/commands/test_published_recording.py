@@ -15,7 +15,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.results.result import Result
-from tests.tui.commands.test_command import huddle
+from tests.command import printed
 from tui.commands.estimate import show_result
 
 PUBLISHED = (
@@ -50,13 +50,13 @@ def tst(usgs_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("usgs") / "tst.h5"
     sources = sorted(str(path) for path in usgs_recording.glob("*.mseed"))
     response = str(usgs_recording / "T-compact_Q330HR_BH_40")
-    huddle("import", *sources, "--response-for", f"*={response}", "--out", str(out))
+    printed("import", *sources, "--response-for", f"*={response}", "--out", str(out))
     return out
 
 
 def result_of(path: Path, *options: str) -> dict[str, Any]:
     """Run ``huddle estimate --json -``."""
-    found: dict[str, Any] = json.loads(huddle("estimate", str(path), *options, "--json", "-"))
+    found: dict[str, Any] = json.loads(printed("estimate", str(path), *options, "--json", "-"))
     return found
 
 
@@ -144,7 +144,7 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
 ) -> None:
     out = tmp_path / "result.json"
     options = ("--segment", "102.4s", "--unit", "m/s²", "--json", str(out))
-    said = " ".join(huddle("estimate", str(tst), *options, "--details").split())
+    said = " ".join(printed("estimate", str(tst), *options, "--details").split())
     _, horizontal = said.split("; in the horizontal plane ")  # some of it is a tilt
     sentence, *_ = horizontal.split(". ")
     shown = [float(angle) for angle in re.findall(r"(\d\.\d+)°", sentence)]
@@ -154,7 +154,7 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
     failing = [band for band in found["bands"] if band["test"]["p_value"] < 0.01]
     assert any(band["low_hz"] < 0.3 < band["high_hz"] for band in failing)  # the microseism
     assert [pair["horizontal_deg"] for pair in found["responses"]] == pytest.approx(shown, abs=1e-3)
-    long = huddle("estimate", str(tst), *options, "--details")
+    long = printed("estimate", str(tst), *options, "--details")
     assert "XX.TST5.00 → XX.TST5.10" in long
 
 
@@ -167,7 +167,7 @@ def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -
         ("--gain", "XX.TST5.10=0"),
         ("--unit", "kg"),
     ):
-        huddle("estimate", str(tst), *options, code=2)
+        printed("estimate", str(tst), *options, code=2)
 
 
 @pytest.mark.long
