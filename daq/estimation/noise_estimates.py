@@ -326,9 +326,11 @@ def with_sets(
             gains=gains[columns],
             chosen=chosen,
         )
-        refused = {**found.refused, **refused}
         for name in wanted:
-            noise = found.results.get(name if is_whole else "maximum-likelihood")
+            used = name if is_whole else "maximum-likelihood"
+            if used in found.refused:
+                refused.setdefault(name, found.refused[used])
+            noise = found.results.get(used)
             if noise is not None and np.isfinite(noise.noise_psd).any():
                 whole = _spread(noise, columns, shape, name)
                 parts.setdefault(name, []).append(whole)

@@ -103,6 +103,12 @@ def test_noise_is_right_where_channels_lack_samples(
     assert snapshot.n_dropped < 2 * N_PARTS
 
 
+def test_two_sensors_that_are_alone_for_a_while_refuse_no_method() -> None:
+    snapshot = estimated("ABC", {f"B{column}": [1] for column in range(3)})
+    assert snapshot.results.keys() == {"three-sensor"}
+    assert not snapshot.refused
+
+
 @pytest.mark.parametrize("octaves", [False, True])
 def test_segments_with_transients_are_left_out_of_every_set(octaves: bool) -> None:
     settings = replace(SETTINGS, octaves=octaves)
