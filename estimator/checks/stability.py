@@ -86,6 +86,9 @@ LEAKS = 0.85
 mean."""
 WEAK = 0.4
 """The same, below which motion is no matter where noise is tested."""
+LEFT = 5.0
+"""Changes of the noise of a part, over those of motion that is left beside the directions of a
+band, that this motion may explain: its power is up to twice what channels share of it."""
 CONFIRMED = 0.5
 """Power of a direction at other frequencies, over the least of both, if it is of motion."""
 LEAST_DEGREES = 8.0
@@ -500,6 +503,14 @@ class _Band:
         return bool((self.levels.statistic > most).any())
 
     @property
+    def is_of_motion(self) -> bool:
+        """Whether motion that is left may be what changes."""
+        if self.levels is None:
+            return False
+        more = self.levels.deviation**2 - self.levels.expected**2
+        return bool(0 < more.max() < (LEFT * self.scores.left) ** 2)
+
+    @property
     def inflation(self) -> float:
         """Variance of the scores of pairs over that for steady noise; 1 where it is not known."""
         return 1.0 if self.levels is None else self.scores.inflation(self.levels)
@@ -528,7 +539,8 @@ def _of_weak_motion(
     """Return what the parts show of a band whose noise may look like motion where it changes.
 
     Directions of the motion are those of the mean of the frequencies, as many as each half of these
-    shows and the other confirms: the scatter of noise differs between frequencies.
+    shows and the other confirms: the scatter of noise differs between frequencies. None where
+    directions of the motion differ, too, so that what changes may be motion that these leave.
     """
     bins = parts.bins[places]
     if len(places) < FREQUENCIES // 2 or (psd[bins] <= 0).any():
@@ -552,7 +564,9 @@ def _of_weak_motion(
     if shared > LEAKS or not found.converged[0] or found.boundary.any():
         return None
     band = of_band(found, places, is_weak=True)
-    if found.n_factors and band is not None and band.is_unsteady:  # its scatter may be in these
+    if band is None or band.is_of_motion:
+        return None
+    if found.n_factors and band.is_unsteady:  # its scatter may be in these
         still = of_band(maximise(both, 0), places, is_weak=True)
         return band if still is None else replace(band, scores=still.scores)
     return band
@@ -603,7 +617,7 @@ def _band(
         spread += own.sum()
         piece = noise_levels(found, own)
         levels.append(piece)
-        scores.add(found, own)
+        scores.add(found, own, np.repeat(np.arange(len(dims)), dims) if is_weak else None)
         each = ResponseScores(dims, len(groups))
         if not is_weak:
             each.add(found, own)
@@ -879,18 +893,23 @@ class _Scores:
         n_pairs = len(self._i)
         self.score = np.zeros((n_parts, n_pairs))
         self._theory, self._own = np.zeros(n_pairs), np.zeros(n_pairs)
+        self._products, self._squares = np.zeros((2, n_parts, n_parts))
+        self._n_products = 0
 
-    def add(self, found: Regression, correlation: FloatArray) -> None:
-        """Add frequencies."""
+    def add(
+        self, found: Regression, correlation: FloatArray, sensor_of: IntArray | None = None
+    ) -> None:
+        """Add frequencies; where `sensor_of` gives the sensor of each channel, also for `left`."""
         n_freqs = len(found.projector)
         at_once = max(1, PAIR_BYTES // (16 * n_freqs * self._n_channels))
         averages = 1 / np.mean(1 / found.averages)
+        products = np.zeros((n_freqs, *self._products.shape))
         for low in range(0, len(self._i), at_once):
             some = slice(low, low + at_once)
             i, j = self._i[some], self._j[some]
             projector = found.projector
             with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-            score = 2 * found.covariance[:, :, i, j]
+            score = 2 * (found.covariance[:, :, i, j] - projector[:, i, j].real)
             score -= (found.noise[:, :, None, :] @ with_noise)[:, :, 0]
             known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
             known -= np.einsum("fpa,fpa->fa", with_noise, found.inverse @ with_noise)
@@ -898,6 +917,27 @@ class _Scores:
             self.score[:, some] += score.sum(axis=1)
             self._theory[some] += (root * (correlation @ root)).sum(axis=0) / averages
             self._own[some] += known.sum(axis=0)
+            if sensor_of is not None:
+                shared = score[:, :, sensor_of[i] != sensor_of[j]].swapaxes(0, 1) / 2
+                products += shared @ shared.swapaxes(1, 2)
+                self._n_products += n_freqs * shared.shape[2]
+        self._products += products.sum(axis=0)
+        self._squares += (products**2).sum(axis=0)
+
+    @property
+    def left(self) -> float:
+        """Standard deviation, between parts, of what sensors share; 0 unless that is significant.
+
+        Over the noise, rms of pairs of channels. Noise of two parts is independent; motion has the
+        directions of its frequency in both.
+        """
+        n = len(self._products)
+        apart = ~np.eye(n, dtype=np.bool_)
+        total, scatter = self._products[apart].sum(), 2 * self._squares[apart].sum()
+        if not total > SIGNIFICANCE * np.sqrt(scatter):
+            return 0.0
+        by_part = (self._products * apart).sum(axis=1) / (n - 1)
+        return float(by_part.std(ddof=1) / np.sqrt(total / (n * (n - 1)) * self._n_products))
 
     def of_parts(self, some: BoolArray) -> _Scores:
         """Return those of some parts."""
