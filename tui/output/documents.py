@@ -28,6 +28,7 @@ from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.sensitivities import Cause
 from estimator.checks.stability import Stability
 from estimator.decision.verdict import Obstacle, Verdict
+from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.noise_parameters.allan import AllanDeviation
 from estimator.noise_parameters.fit import NoiseParameters
@@ -358,7 +359,7 @@ class FactDocument(TypedDict):
 class ContributionDocument(TypedDict):
     """What widens an interval beyond the scatter."""
 
-    source: Annotated[str, "clocks, edges, gaps, axes, misfit, shared-noise, dimensions or faulty."]
+    source: Annotated[Source, "The cause."]
     below: Annotated[float, "How far the lower end is lowered, in unit²/Hz; null: without limit."]
     above: Annotated[float, "How far the upper end is raised, in unit²/Hz; null: without limit."]
 
