@@ -41,6 +41,8 @@ html_extra_path = [
     "../tui/resources/result-2.schema.json",
     "../tui/resources/archive-2.schema.json",
     "../tui/resources/archive-stations-1.schema.json",
+    "../tui/resources/calibration-1.schema.json",
+    "../tui/resources/status-1.schema.json",
 ]
 
 default_role = "py:obj"
@@ -72,7 +74,9 @@ class Reference(SphinxDirective):
             "facts": reference.facts,
             "findings": reference.findings,
             "packages": reference.packages,
-            "result": reference.result,
+            "result": partial(reference.keys, "result-2.schema.json"),
+            "calibration": partial(reference.keys, "calibration-1.schema.json"),
+            "status": partial(reference.keys, "status-1.schema.json"),
             **{name: partial(reference.values, name) for name in reference.VALUES},
         }
         found: list[nodes.Node] = self.parse_text_to_nodes(

@@ -93,10 +93,9 @@ def bench_file() -> str:
     return "\n".join(_section(path, model) for path, model in tables.items())
 
 
-def result() -> str:
-    """Return a table for each object of the JSON of a result, made of its schema."""
-    text = (resources.files("tui.resources") / "result-2.schema.json").read_text("utf-8")
-    schema = json.loads(text)
+def keys(file: str) -> str:
+    """Return a table for each object of a JSON document, made of its schema."""
+    schema = json.loads((resources.files("tui.resources") / file).read_text("utf-8"))
     parts = []
     for name, each in {"document": schema, **schema["$defs"]}.items():
         rows = [f"| `{key}` | {meaning} |" for key, meaning in _keys(each, "")]

@@ -13,6 +13,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from datetime import date
 from enum import Enum, EnumType
 from functools import cache
 from pathlib import Path
@@ -32,7 +33,13 @@ from typing import (
 import numpy as np
 
 from estimator.records import json_key
-from tui.output.documents import ArchiveDocument, ResultDocument, StationsDocument
+from tui.output.documents import (
+    ArchiveDocument,
+    CalibrationDocument,
+    ResultDocument,
+    StationsDocument,
+)
+from tui.service.documents import StatusDocument
 
 Schema = dict[str, Any]
 FOLDER = Path(__file__).parents[1] / "tui" / "resources"
@@ -40,10 +47,13 @@ ROOTS: dict[str, tuple[Any, str]] = {
     "result-2.schema.json": (ResultDocument, "Result of a huddle test, version 2"),
     "archive-2.schema.json": (ArchiveDocument, "Answer of an archive, version 2"),
     "archive-stations-1.schema.json": (StationsDocument, "Answers of several stations, version 1"),
+    "calibration-1.schema.json": (CalibrationDocument, "Calibration of sensors, version 1"),
+    "status-1.schema.json": (StatusDocument, "Status of a service, version 1"),
 }
 """The document of each file, and its title. A file refers to those before it."""
 PLAIN: dict[Any, Schema] = {
     str: {"type": "string"},
+    date: {"type": "string", "format": "date"},
     **{kind: {"type": "boolean"} for kind in (bool, np.bool_)},
     **{kind: {"type": "integer", "minimum": 0} for kind in (int, np.int64)},
     **{kind: {"type": ["number", "null"]} for kind in (float, np.float64)},

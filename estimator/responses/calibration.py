@@ -55,10 +55,10 @@ class SensorCalibration:
     angle_deg : Value, shape (d,)
         Angle between each channel and that of the reference, non-negative; NaN for one channel.
         Its errors are of first order: near 0 and 180° they do not hold.
-    orthogonality_deg : Value, shape (d (d - 1) / 2,)
+    orthogonality_deg : Value, shape (n_pairs,)
         Angles between channels 12, 13, 23, minus 90°.
     delay : Value, shape (d,)
-        Lag of each channel behind the reference, s; NaN if ambiguous.
+        Lag of each channel behind the reference, s; NaN if ambiguous, or if the clocks are aligned.
     skew : Value, shape (d,)
         Delay of each channel minus that of the first.
     is_ambiguous : bool

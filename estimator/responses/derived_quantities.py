@@ -21,8 +21,8 @@ class Value:
     value, error : float64, equal shapes
     """
 
-    value: FloatArray
-    error: FloatArray = field(metadata={"key": "standard_error"})
+    value: FloatArray = field(metadata={"type": "array"})
+    error: FloatArray = field(metadata={"key": "standard_error", "type": "array"})
 
 
 def derived(matrix: FloatArray) -> dict[str, FloatArray]:

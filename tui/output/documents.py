@@ -1,4 +1,4 @@
-"""JSON documents of results and archives: every key with its type and a note.
+"""JSON documents of results, calibrations and archives: every key with its type and a note.
 
 The writers, `tui.output.json_document` and `tui.output.archive.document`, return these types;
 ``python -m docs.schema`` makes the JSON Schemas in ``tui/resources`` of them. Commands do not load
@@ -15,13 +15,15 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, NotRequired, TypeAlias, TypedDict
 
 from daq.archive.changes import Interval
-from daq.clocks.clock_model import ClockState
+from daq.bench.channel import Certificate
+from daq.clocks.clock_model import ClockState, RelativeTime
 from daq.estimation.noise_estimates import ALL_METHODS
 from daq.estimation.snapshot import Bridged, Octave, SensorTotals
 from daq.estimation.snapshot_diagnostics import EdgeLeakage, FrequencyDiagnosis
 from daq.results.decision.verdict import LimitResult
 from daq.results.noise_parameters import SheetComparison
 from daq.results.sources import LoggedEvent
+from daq.results.uncertainty_budget import Component
 from estimator.checks.advice import Rank, Untested
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
@@ -32,6 +34,7 @@ from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.noise_parameters.allan import AllanDeviation
 from estimator.noise_parameters.fit import NoiseParameters
+from estimator.responses.calibration import SensorCalibration
 from estimator.spectra.segment_rejection import Reason
 from estimator.types import FloatArray, IntArray
 
@@ -470,6 +473,61 @@ class SeveralEstimatesDocument(WholeDocument):
 
 
 ResultDocument: TypeAlias = OneEstimateDocument | SeveralEstimatesDocument
+
+
+class ResponseDocument(TypedDict):
+    """Response of a sensor relative to the reference, in thirds of an octave."""
+
+    frequency_hz: Annotated[Frequencies, "Mean frequency of each band."]
+    real: Annotated[Cube, "Bands × channels × channels of the reference; null if not known."]
+    imag: Annotated[Cube, "Likewise."]
+    standard_error: Annotated[Cube, "Of the real, and of the imaginary part."]
+
+
+class CalibratedKeys(TypedDict):
+    """What JSON says of a calibrated sensor beside its fields."""
+
+    sensor: Annotated[str, "Name of the sensor."]
+    channels: Annotated[list[str], "Names of its channels."]
+    band_hz: Annotated[tuple[Finite, Finite], "Band."]
+    relative_time: Annotated[RelativeTime, "How its times are known against the reference."]
+    curve: ResponseDocument
+
+
+class BudgetDocument(TypedDict):
+    """Uncertainty of one value of one channel in one band."""
+
+    sensor: Annotated[str, "Name of the sensor."]
+    channel: Annotated[str, "Name of the channel."]
+    quantity: Annotated[
+        str,
+        ("enum", ("sensitivity", "noise")),
+        "sensitivity: in counts per unit if is_absolute, otherwise relative to the bench file; "
+        "noise: PSD by the calibrated sensitivities.",
+    ]
+    is_absolute: Annotated[bool, "Whether the value rests on a certificate."]
+    band_hz: Annotated[tuple[Finite, Finite], "Band."]
+    value: Annotated[float, "The value."]
+    components: Annotated[tuple[Component, ...], "Lines of the budget."]
+    combined_relative: Annotated[float, "Combined standard uncertainty, as a fraction of it."]
+    effective_degrees_of_freedom: Annotated[float, "By Welch and Satterthwaite; null: no limit."]
+    k: Annotated[float, "Coverage factor."]
+    expanded_uncertainty: Annotated[float, "Expanded uncertainty, in the unit of the value."]
+
+
+class CalibrationDocument(TypedDict):
+    """What huddle calibrate --json writes."""
+
+    reference: Annotated[str, "Sensor that all others are compared with."]
+    is_absolute: Annotated[bool, "Whether results rest on certificates in the bench file."]
+    certificates: Annotated[tuple[Certificate, ...], "Of each channel of the reference."]
+    confidence: Annotated[Finite, "Level of the expanded uncertainties."]
+    refused: Annotated[Mapping[str, str], "Why a sensor is not calibrated, by sensor."]
+    without_noise: Annotated[list[str], "Channels without a budget of the noise."]
+    sensors: Annotated[
+        list[Annotated[SensorCalibration, CalibratedKeys]], "Each other sensor, over the band."
+    ]
+    budgets: Annotated[list[BudgetDocument], "Of each channel, quantity and band."]
 
 
 class DoubtedDocument(TypedDict):

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from daq.results.result import Result
     from tui.output.documents import (
         BandMeanDocument,
+        CalibrationDocument,
         CaveatsDocument,
         DiagnosticsDocument,
         EstimateDocument,
@@ -354,7 +355,7 @@ def _finding(advice: Advice) -> FindingDocument:
     }
 
 
-def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, Any]:
+def calibration_document(found: Calibration, snapshot: Snapshot) -> CalibrationDocument:
     """Return a calibration as JSON (docs/json.md)."""
     names = snapshot.sensor_names
     curves = {each.sensor: each for each in found.curves}
@@ -366,14 +367,14 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
         "refused": {names[sensor]: why for sensor, why in found.refused.items()},
         "without_noise": [label.name for label in found.without_noise],
         "sensors": [
-            {
+            plain(each)
+            | {
                 "sensor": names[each.sensor],
                 "channels": channels_of(snapshot, each.sensor),
                 "band_hz": [each.low, each.high],
                 "relative_time": relative_time(
                     snapshot, names[each.sensor], names[found.reference]
                 ),
-                **plain(each),
                 "curve": {
                     "frequency_hz": curves[each.sensor].frequency,
                     "real": curves[each.sensor].matrix.real,
@@ -389,7 +390,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> dict[str, An
                 "channel": each.channel,
                 "quantity": each.quantity,
                 "is_absolute": each.is_absolute,
-                "band_hz": [each.low, each.high],
+                "band_hz": (each.low, each.high),
                 "value": each.value,
                 "components": each.components,
                 "combined_relative": each.combined,

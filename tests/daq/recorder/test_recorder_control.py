@@ -15,6 +15,7 @@ from daq.errors import (
 from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from tests.daq.recorder.test_recorder import Run
+from tui.service.documents import RecordedSensorDocument
 
 pytestmark = pytest.mark.virtual_time
 
@@ -48,6 +49,7 @@ async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None
         await run.sent("a", 0, 100)
         status = await asyncio.to_thread(ask, run.path, "status")
         assert status["sensors"]["a"]["samples"] == 100
+        assert status["sensors"]["a"].keys() == RecordedSensorDocument.__required_keys__
         await asyncio.to_thread(ask, run.path, "mark", "a door\nslammed")
         address = control_address(run.path)
         assert address is not None

@@ -28,6 +28,7 @@ from daq.results.result import Result
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.responses.derived_quantities import Value
 from tests.daq.clocks.recordings import Sensor, write
+from tests.tui.schemas import validate
 from tui.commands.calibrate import side_by_side
 from tui.commands.main import app
 from tui.output.calibration import angle, remarks, sensitivity_table, with_error
@@ -100,7 +101,9 @@ def test_a_delay_is_known_only_where_clocks_are(
     shown = CliRunner().invoke(
         app, ["calibrate", str(path), "--segment", "2s", "--band", "1:20", "--json", "-"]
     )
-    told = json.loads(shown.stdout)["sensors"][1]
+    document = json.loads(shown.stdout)
+    validate("calibration-1", document)
+    told = document["sensors"][1]
     assert told["relative_time"] == time
     assert told["delay"]["value"] == ([None] * 3 if math.isnan(delay) else late.value.tolist())
     assert ("Delay of b, c: not known" in shown.stderr) == math.isnan(delay)
@@ -346,6 +349,7 @@ def test_the_command_says_it_all(recording: Path) -> None:
     )
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
+    validate("calibration-1", found)
     assert found["reference"] == "a"
     assert [each["sensor"] for each in found["sensors"]] == ["b", "c"]
     gain = found["sensors"][0]["gain"]

@@ -12,14 +12,11 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from jsonschema import Draft202012Validator
-from referencing import Registry, Resource
 from typer.testing import CliRunner
 
 from daq.archive.answers import answer
@@ -42,9 +39,7 @@ from tests.daq.archive.months import (
     three,
 )
 from tests.known_clocks import Oscillator, Scene
-from tests.tui.output.test_result_schema import SCHEMA as RESULT
-from tests.tui.output.test_result_schema import strict
-from tests.tui.thinned import thinned
+from tests.tui.schemas import validate
 from tests.waiting import finish, wait_until
 from tui.commands.main import app
 from tui.output.archive.tables import course_table
@@ -52,12 +47,6 @@ from tui.page import drawing
 from tui.report.figures import archive
 from tui.report.figures.archive import days_figure, density_figure
 
-SCHEMA: dict[str, Any] = json.loads(
-    (resources.files("tui.resources") / "archive-2.schema.json").read_text("utf-8")
-)
-STATIONS: dict[str, Any] = json.loads(
-    (resources.files("tui.resources") / "archive-stations-1.schema.json").read_text("utf-8")
-)
 OPTIONS = ("--segment", "10s", "--method", "three-sensor")
 PLAIN = ("--equalise", "off", "--bridge", "0")
 """As the spectra of archives are."""
@@ -78,13 +67,6 @@ asyncio.run(serve())
 
 def huddle(*arguments: object) -> Any:  # noqa: ANN401 - click's result
     return CliRunner().invoke(app, ["archive", *map(str, arguments)], terminal_width=200)
-
-
-def validate(document: dict[str, Any]) -> None:
-    """Compare a document with the published schema, which has all of its keys."""
-    registry = Registry().with_resource("result-2.schema.json", Resource.from_contents(RESULT))
-    assert document.keys() == SCHEMA["properties"].keys()
-    Draft202012Validator(strict(SCHEMA), registry=registry).validate(thinned(document))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +96,7 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
         for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
             a, b = (np.array(each[key], dtype=float) for each in (one, other))
             np.testing.assert_allclose(a, b, rtol=1e-9)
-    validate(found)
+    validate("archive-2", found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
     assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)
     assert found["archive"] == {
@@ -340,7 +322,7 @@ def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> N
     (left,) = document["archive"]["doubted"]
     bad = str((tmp_path / "bad.h5").resolve())
     assert left == {"source": bad, "clocks": ["B"]}
-    validate(document)
+    validate("archive-2", document)
     facts = {each["kind"]: each for each in document["facts"]}
     assert list(facts) == [
         "recordings-left-out", "changes-undecided", "stretches-left-out", "nights-not-compared",
@@ -395,12 +377,7 @@ def test_stations_have_an_archive_each_and_a_line_in_the_table(
     every = huddle("--store", store, "--json", "-", "--csv", tmp_path / "days.csv")
     assert every.exit_code == 0, every.output
     document = json.loads(every.stdout)
-    registry = Registry().with_resources(
-        (name, Resource.from_contents(schema))
-        for name, schema in (("result-2.schema.json", RESULT), ("archive-2.schema.json", SCHEMA))
-    )
-    assert document.keys() == STATIONS["properties"].keys()
-    Draft202012Validator(strict(STATIONS), registry=registry).validate(thinned(document))
+    validate("archive-stations-1", document)
     assert [each["station"] for each in document["stations"]] == ["XX.ABC", "XX.DEF"]
     assert document["stations"][0]["answer"] == json.loads(one.stdout)
     rows = list(csv.DictReader((tmp_path / "days.csv").read_text("utf-8").splitlines()))
@@ -429,7 +406,7 @@ def test_a_single_station_is_answered(sds: Path, tmp_path: Path) -> None:
     document = json.loads(said.stdout)
     assert document["archive"]["recordings"] == 1
     assert document["pooled"]["segments"] == 2879
-    validate(document)
+    validate("archive-2", document)
 
 
 @pytest.mark.parametrize(

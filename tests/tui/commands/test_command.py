@@ -401,7 +401,7 @@ def test_noise_parameters_on_request(tmp_path: Path) -> None:
     white = first["terms"]["white"]
     assert abs(white["value"] - 0.01 / 50) < 4 * white["error"]
     assert len(first["allan_deviation"]["tau"]) == len(first["allan_deviation"]["deviation"])
-    documented = reference.result()
+    documented = reference.keys("result-2.schema.json")
     assert not [key for key in first if f"`{key}`" not in documented]
 
 
@@ -497,7 +497,8 @@ def test_plan_says_how_long_to_record(tmp_path: Path) -> None:
 
 def test_what_is_written_as_json_is_documented(tmp_path: Path) -> None:
     bench, out = str(tmp_path / "lab.toml"), str(tmp_path / "model.h5")
-    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8") + reference.result()
+    said = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    said += reference.keys("result-2.schema.json")
     printed("init", "--out", bench)
     for command in (
         ("check", bench, "--no-devices"),

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from daq.errors import HuddleError
 from tests.command import huddle, printed
 from tests.torture.damaged_files import make_recording
+from tests.tui.schemas import validate
 from tests.tui.service.bench_files import START
 from tui.commands.main import app
 from tui.commands.tui_controls import pin
@@ -94,7 +95,12 @@ def test_verify_walks_what_is_kept(place: Path) -> None:
 
 
 def test_status_with_and_without_a_service(place: Path) -> None:
+    recorded = Run("bench", "1", START + timedelta(hours=2), 60.0)
+    recorded = recorded.to(RunState.RECORDING, started=recorded.due, parts=("a.h5",))
+    RunStore(place.parent / "recordings").save(recorded)
     found = json.loads(printed("status", str(place), "--json", "-", code=3))
+    validate("status-1", found)
+    assert found["recording"]["ends"] == "2026-11-21T14:01:30Z"
     assert found["running"] is False
     assert found["last"]["state"] == "failed"
     assert found["next"]["due"].startswith("2037-11-03")

@@ -23,33 +23,11 @@ from docs.schema import texts
 from tests.daq.clocks.recordings import write_polled
 from tests.full_disk import files_limited_to
 from tests.tui.night_recording import HOSTILE, record
-from tests.tui.thinned import thinned
+from tests.tui.schemas import SCHEMAS, thinned, validate, validator
 from tui.commands.main import app
 from tui.output.json_document import SCHEMA_VERSION
 
-SCHEMA: dict[str, Any] = json.loads(
-    (resources.files("tui.resources") / f"result-{SCHEMA_VERSION}.schema.json").read_text("utf-8")
-)
-OPEN = ("settings",)
-"""Objects with keys that the schema does not describe."""
-
-
-def strict(schema: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema, refusing keys that it does not describe: all are documented."""
-    closed = copy.deepcopy(schema)
-
-    def close(part: object, name: str = "") -> None:
-        if isinstance(part, dict):
-            if "properties" in part and name not in OPEN and part.get("type") == "object":
-                part.setdefault("additionalProperties", False)
-            for key, entry in part.items():
-                close(entry, key)
-        elif isinstance(part, list):
-            for entry in part:
-                close(entry)
-
-    close(closed)
-    return closed
+SCHEMA = SCHEMAS[f"result-{SCHEMA_VERSION}.schema.json"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +61,7 @@ def test_a_recording_of_many_blocks_is_described(tmp_path: Path) -> None:
     with Recording.open(path) as recording:
         assert all(len(each.blocks) > 2 * _NEWEST_ROWS for each in recording.sensors)
     found = estimated(path, "--segment", "20s")
-    Draft202012Validator(strict(SCHEMA)).validate(found)
+    validate("result-2", found)
     assert found["recordings"][0]["sensors"]
 
 
@@ -121,11 +99,11 @@ def test_one_wrong_number_of_many_is_refused(written: Written, wrong: object) ->
     numbers = next(each for each in channel.values() if isinstance(each, list) and len(each) > 20)
     numbers[17] = wrong
     document = written.document | {"channels": [channel]}
-    assert not Draft202012Validator(strict(SCHEMA)).is_valid(thinned(document))
+    assert not validator("result-2").is_valid(thinned(document))
 
 
 def test_one_method_with_limits_gaps_and_noise_parameters(written: Written) -> None:
-    Draft202012Validator(strict(SCHEMA)).validate(thinned(written.document))
+    validate("result-2", written.document)
     assert written.document["method"] == "maximum-likelihood"  # four sensors leave room
     assert written.document["verdict"] == "not-decided"
     assert len(written.document["noise_parameters"]) == 8
@@ -133,7 +111,7 @@ def test_one_method_with_limits_gaps_and_noise_parameters(written: Written) -> N
 
 def test_several_methods(written: Written) -> None:
     document = estimated(written.recording, "--method", "all", "--octaves", "--dimension", "auto")
-    Draft202012Validator(strict(SCHEMA)).validate(thinned(document))
+    validate("result-2", document)
     methods = [each["method"] for each in document["results"]]
     assert document["settings"]["method"] == methods
     assert {each["method"] for each in document["band_means"]} == set(methods)
@@ -144,7 +122,7 @@ def test_arrays_have_no_recording() -> None:
     model = huddle.simulate("fig9", duration="1min")
     document = huddle.self_noise(model, fs=model.fs, segment="2s").to_dict()
     found = json.loads(json.dumps(document, default=str))
-    Draft202012Validator(strict(SCHEMA)).validate(thinned(found))
+    validate("result-2", found)
     assert found["run_id"] is None
     assert found["recordings"] == []
 
@@ -193,7 +171,7 @@ def test_band_means_are_those_of_the_table(written: Written) -> None:
 def test_a_growing_recording_has_no_checksum(tmp_path: Path) -> None:
     recording, found = tmp_path / "live.h5", []
     record(recording, before_end=lambda: found.append(estimated(recording)))
-    Draft202012Validator(strict(SCHEMA)).validate(thinned(found[0]))
+    validate("result-2", found[0])
     assert found[0]["recordings"][0]["sha256"] is None
     assert found[0]["recordings"][0]["state"] == "growing"
 
