@@ -307,7 +307,7 @@ def specimen(result: Result, examined: Examined, folder: Path) -> Path:
     result, examined
         As `issue` takes them, of any recordings.
     folder : Path
-        Where it is written; an earlier specimen of the recording is replaced.
+        Where it is written; made if absent. An earlier specimen of the recording is replaced.
 
     Returns
     -------
@@ -324,6 +324,7 @@ def specimen(result: Result, examined: Examined, folder: Path) -> Path:
     )
     content = _content(with_stated(result, examined), examined, made, {})
     name = f"{examined.found[0].path.stem}-specimen.pdf"
+    folder.mkdir(parents=True, exist_ok=True)
     return write_content(folder / name, content, "replace")
 
 

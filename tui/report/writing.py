@@ -89,8 +89,7 @@ def write_content(path: Path, content: bytes, taken: Taken) -> Path:
         write_whole(path, content)
     except OSError as error:
         raise ReportError(
-            f"{path}: the report cannot be written ({error.strerror}); choose another place with "
-            "--out, or make room"
+            f"{path}: cannot be written ({error.strerror}); choose another place, or make room"
         ) from error
     return path
 

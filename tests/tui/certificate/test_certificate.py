@@ -265,10 +265,11 @@ def test_of_simulated_sensors_there_are_specimens_alone(tmp_path: Path) -> None:
     assert found.exit_code == 2
     assert "simulated" in found.stderr
     assert not (tmp_path / "certificates").exists()
-    found = run.invoke(app, ["issue", str(recording), "--specimen"])
+    place = tmp_path / "an absent folder"
+    found = run.invoke(app, ["issue", str(recording), "--specimen", "--folder", str(place)])
     assert found.exit_code == 0, found.output
     assert not (tmp_path / "certificates").exists()
-    path = tmp_path / "s-specimen.pdf"
+    path = place / "s-specimen.pdf"
     pages = ["".join(page.extract_text().split()) for page in PdfReader(path).pages]
     for page in pages:
         assert page.count("SPECIMEN") >= 2  # across the page, and at its foot

@@ -51,7 +51,7 @@ def test_a_test_that_is_still_running_is_preliminary(tmp_path: Path) -> None:
 def test_a_report_is_whole_or_not_there(reported: Reported, tmp_path: Path) -> None:
     out = tmp_path / "old.html"
     out.write_text("the old one", encoding="utf-8")
-    message = r"old.html: the report cannot be written \(File too"
+    message = r"old.html: cannot be written \(File too"
     with files_limited_to(10_000), pytest.raises(ReportError, match=message):
         write(reported.result, out, taken="replace")
     assert out.read_text(encoding="utf-8") == "the old one"
