@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -224,6 +225,32 @@ def test_what_cannot_be_drawn_is_refused_before_the_estimate(
     result = CliRunner().invoke(app, ["plot", "absent.h5", *options], terminal_width=300)
     assert result.exit_code == 2
     assert re.search(said, result.stderr)
+
+
+def test_minor_ticks_as_one_line_look_as_those_of_matplotlib(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def panel(axes: Axes) -> None:
+        axes.loglog([0.03, 70.0], [2.2, 5.0])  # less than a decade has labels at minor ticks
+
+    plot = Plot("", (panel, panel), n_columns=2, height=1.5, alt="two lines")
+
+    def picture() -> tuple[bytes, list[int]]:
+        content = io.BytesIO()
+        with drawing.look():
+            figure = drawing.alone(plot, 7.1)
+            figure.savefig(content, format="raw")
+        counts = [
+            len(each.get_minor_ticks()) for each in (figure.axes[0].xaxis, figure.axes[0].yaxis)
+        ]
+        return content.getvalue(), counts
+
+    joined, (n_along, n_up) = picture()
+    monkeypatch.setattr(drawing, "_join_minor_ticks", lambda _: None)
+    apart, (n_apart, n_up_apart) = picture()
+    assert (n_along, n_up) == (0, n_up_apart)
+    assert min(n_apart, n_up_apart) > 0
+    assert joined == apart
 
 
 def test_of_one_sensor_the_psd_is_drawn() -> None:
