@@ -30,7 +30,8 @@ from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.stability import SegmentCourse, Stability
+from estimator.checks.disturbed_segments import SegmentCourse
+from estimator.checks.stability import Stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
 from estimator.median import median

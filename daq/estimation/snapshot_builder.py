@@ -73,7 +73,8 @@ from daq.estimation.throttle import Throttle
 from daq.protocols.block import Event, Quantity, Reading
 from daq.recording.interface import ReadableRecording
 from estimator.checks.advice import Untested
-from estimator.checks.stability import SegmentCourse, Stability
+from estimator.checks.disturbed_segments import SegmentCourse
+from estimator.checks.stability import Stability
 from estimator.checks.steadied import Steadied
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima

@@ -16,6 +16,7 @@ import numpy as np
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from estimator.checks.band import BandDiagnosis
+from estimator.checks.disturbed_segments import SegmentCourse
 from estimator.checks.noise_within import beside_matrices
 from estimator.checks.relative_response import (
     PairProducts,
@@ -32,7 +33,7 @@ from estimator.checks.shared_motion import (
     significant_dimensions,
 )
 from estimator.checks.shared_noise import shared_noise
-from estimator.checks.stability import SegmentCourse, Stability, stability
+from estimator.checks.stability import Stability, stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.dimension import bands

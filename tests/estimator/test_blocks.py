@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from estimator.checks import shared_noise, stability
+from estimator.checks import band_steadiness, shared_noise
 from estimator.checks.diagnose import diagnose
 from estimator.checks.shared_motion import CanonicalCoherence, is_coherent, seen_by_others
 from estimator.likelihood.factor_analysis import maximise
@@ -81,7 +81,7 @@ def test_an_estimate_of_many_channels_keeps_few_matrices(monkeypatch: pytest.Mon
     csm, dims = _averages(8), (3,) * 8
     frequency = np.arange(1.0, N_FREQS + 1)
     monkeypatch.setattr(coherency, "BLOCK_BYTES", 2 * csm[0].nbytes)
-    monkeypatch.setattr(stability, "PAIR_BYTES", 1 << 16)
+    monkeypatch.setattr(band_steadiness, "PAIR_BYTES", 1 << 16)
     monkeypatch.setattr(shared_noise, "MAX_CHANNELS", 0)  # it takes the square of all pairs
     few = 20.0  # averages, with which nothing is fitted
     assert peak_of(lambda: diagnose(csm, frequency, dims=dims, n_effective=few)) < 5 * csm.nbytes

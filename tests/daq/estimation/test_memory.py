@@ -10,7 +10,8 @@ import pytest
 
 from daq.clocks.kalman import Observations, smooth
 from daq.estimation.estimation import bytes_of
-from estimator.checks.stability import SegmentCourse, stability
+from estimator.checks.disturbed_segments import SegmentCourse
+from estimator.checks.stability import stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.spectra.parts import Part, Parts

@@ -9,13 +9,14 @@ import pytest
 
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.disturbed_segments import SegmentCourse
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
     may_have_moved,
     moved,
     shared_motion,
 )
-from estimator.checks.stability import Scatter, SegmentCourse, Stability
+from estimator.checks.stability import Scatter, Stability
 from estimator.checks.steadied import Steadied
 from estimator.checks.steadiness import ResponseChange
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
