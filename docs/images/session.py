@@ -8,6 +8,7 @@ come to the screen ends the session with an error, and docs/session.md stays as 
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import tempfile
@@ -103,10 +104,11 @@ class Session:
             self.n_keys += len(_KEY.findall(key))
             time.sleep(0.3)
 
-    def ask(self, question: str, *keys: str, answer: str) -> str:
+    def ask(self, question: str, *keys: str, answer: str, without: str = "") -> str:
         """Press keys; keep the row of the answer, and the seconds that it took to come."""
         self.press(*keys)
         seconds = self._terminal.wait_for(answer, timeout=60)
+        self.see(without=without)
         row = next(row for row in self._terminal.rows if answer in row)
         shown = " ".join(_FRAME.sub(" ", row.rpartition("▌")[2]).split())[:70]
         pressed = " ".join(NAMES.get(key, key) for each in keys for key in _KEY.findall(each))
@@ -187,7 +189,7 @@ def drive(session: Session) -> None:
     )
     session.press("x", "y")
     session.see("recording  ", "channel    data", "w Report")
-    session.ask("Which tests are there?", "4", answer="e Estimate")
+    session.ask("Which tests are there?", "4", answer="▸ 20")
     session.ask(
         "How does this compare with the test before?", "\x1b[B", "c", answer="compared with"
     )
@@ -214,24 +216,42 @@ def signal_view(session: Session) -> None:
     row = session.ask("What happened to B's cable, and when?", "n", "n", "n", answer="B gap")
     at = row.split()[0][:5]
     session.ask(f"What happened at {at}?", "t", at, "\r", answer=" to ")
-    session.ask("When was it loud?", "g", answer="recorded")
-    session.ask("When was the noise loud?", "g", answer="noise")
-    session.ask("Which sensor hums?", "\x1b[B", "\x1b[B", "\x1b[B", answer="B.X noise")
+    session.ask("When was it loud?", "g", answer="recorded", without="drawing")
+    session.ask("When was the noise loud?", "g", answer="noise", without="drawing")
+    session.ask(
+        "Which sensor hums?", "\x1b[B", "\x1b[B", "\x1b[B", answer="B.X noise", without="drawing"
+    )
     session.ask("Leave this out.", "g", "x", ">", "x", answer="excluded (x: take it back)")
-    session.ask("Take it back.", "x", answer=" B.X −")
+    session.ask("Is it left out?", "3", answer="by choice of the time")
+    session.press("5")
+    session.see("x Exclude")
+    session.ask("Take it back.", "x", answer=" B.X ", without="take it back")
+
+
+def test_before(folder: Path) -> None:
+    """Do a short test of the same sensors, for a ledger of its own."""
+    os.environ["HUDDLE_SENSORS"] = str(folder / "sensors.sqlite")
+    earlier = folder / "earlier"
+    earlier.mkdir()
+    with simulated(earlier) as bench:
+        test = python_command("tui", "run", str(bench), "--duration", "4min")
+        subprocess.run(test, cwd=earlier, stdout=subprocess.DEVNULL, check=False)
 
 
 def main() -> None:
     """Drive the session; write the page."""
-    with tempfile.TemporaryDirectory(prefix="lab-") as name, simulated(Path(name)) as bench:
-        terminal = Terminal(bench, SIZE, None)
-        session = Session(terminal, Path(name))
-        try:
-            drive(session)
-        finally:
-            session.press("\x1b", "2", "x", "y")  # no recorder stays behind a session that failed
-            time.sleep(3)
-            terminal.close()
+    with tempfile.TemporaryDirectory(prefix="lab-") as name:
+        folder = Path(name)
+        test_before(folder)
+        with simulated(folder) as bench:
+            terminal = Terminal(bench, SIZE, None)
+            session = Session(terminal, folder)
+            try:
+                drive(session)
+            finally:
+                session.press("\x1b", "2", "x", "y")  # no recorder stays behind a failed session
+                time.sleep(3)
+                terminal.close()
     walk = f"\nFrom the first key to the specimen of the certificate: {session.walk} keys.\n"
     PAGE.write_text(session.page + QUESTIONS + session.answers + walk, encoding="utf-8")
 
