@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daq.results.decision.end import Goal, Remaining
 from daq.results.decision.facts import LimitUndecided, WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict, facts_of_verdict
+from estimator.checks.advice import Rank
 from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
 from estimator.records import dataclass
 from estimator.wording import listed, percent, roughly, several, signed
@@ -79,9 +80,12 @@ class Decision:
         steps = what_to_do(found)
         if record_for(found):  # by time alone: nothing else is missing
             steps = [steps[-1], *steps[:-1]]
-        usual = REPAIR if found.verdict is Verdict.FAIL else SEE_FACTS
-        if found.verdict is Verdict.PASS and not any(each.needs_action for each in result.facts):
+        needed = {each.rank for each in result.facts if each.needs_action}
+        usual = SEE_FACTS
+        if found.verdict is Verdict.PASS and not needed:
             usual = NOTHING_TO_DO
+        elif found.verdict is Verdict.FAIL and Rank.INVALIDATES not in needed:
+            usual = REPAIR
         remarks = (*steps[1:], *not_judged(found))
         return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
 

@@ -20,7 +20,7 @@ from tui.commands.estimate import show_result
 from tui.notebook import text
 from tui.report.noise import verdict
 from tui.wording.facts import NOTHING_TO_DO, brief
-from tui.wording.verdict_text import Decision, how_long, in_tone
+from tui.wording.verdict_text import REPAIR, Decision, how_long, in_tone
 
 ALONE = ModelMisfit(
     rank=Rank.INVALIDATES, sensors=(), band=(0.5, 8.3), statistic=30.0, n_factors=3,
@@ -71,8 +71,10 @@ def test_the_first_line_answers_is_it_good_and_what_next(
     )
     assert text.text(result).splitlines()[0].startswith(lines[0][:90])
     assert verdict(result).text.startswith(lines[0])
-    needed = any(each.needs_action for each in result.facts)
+    needed = {each.rank for each in result.facts if each.needs_action}
     assert (decision.next_step == NOTHING_TO_DO) == (is_good and not needed)
+    is_bad = decision.state is Verdict.FAIL
+    assert (decision.next_step == REPAIR) == (is_bad and Rank.INVALIDATES not in needed)
 
 
 def test_the_tests_above_have_all_verdicts() -> None:
