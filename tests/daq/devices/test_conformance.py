@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from pathlib import Path
 from typing import cast
 
@@ -17,13 +17,15 @@ from daq.conformance.replay import replay
 from daq.conformance.suite import (
     EARLY,
     LATENCY,
+    check_blocks,
     check_counters,
     check_truth,
+    stranger,
     watching_the_loop,
 )
 from daq.devices.registry import driver_names, driver_type
 from daq.errors import DeviceError, NoAnswerError, NotConnectedError
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event
+from daq.protocols.block import Block, DeviceItem, Event
 from daq.protocols.errors import RemoteProtocolError
 from daq.transport.wire_log import WireLog, session_ends, using
 from tests.daq.devices.driver_modes import CASES, RATE, Served, serving_all
@@ -56,42 +58,27 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
     chosen = served.sensors(mode)
     wanted = round(N * chosen[0].sampling_rate / RATE)
     by_name = {sensor.name: sensor for sensor in chosen}
-    found: dict[str, list[Block]] = {name: [] for name in by_name}
+    found: list[DeviceItem] = []
     clock = host_clock(SPEED)
     begin = clock.now()
     for _ in range(2):  # the port is free again after a session, and a session begins anew
-        found = {name: [] for name in by_name}
+        found, ends = [], dict.fromkeys(by_name, 0)
         async with kind.open(chosen, clock) as session:
             assert [one.sensor for one in session.information] == list(by_name)
             assert not any(one.trouble for one in session.information)
             stream = cast("AsyncGenerator[DeviceItem]", session.read())
             async with contextlib.aclosing(stream) as items:
                 async for item in items:
-                    if isinstance(item, Event):
-                        assert item.kind in {"connected", "status"}, item
-                    if not isinstance(item, Block):
-                        continue
-                    found[item.sensor].append(item)
-                    if all(b and b[-1].end_sample >= wanted for b in found.values()):
+                    found.append(item)
+                    if isinstance(item, Block):
+                        ends[item.sensor] = item.end_sample
+                    if min(ends.values()) >= wanted:
                         break
-    for name, blocks in found.items():
-        first = blocks[0]
-        assert first.first_sample == 0
-        assert BlockFlag.CLOCK_RESTART in first.flags
-        assert not first.reason
-        end, at = 0, begin.monotonic_ns
-        for block in blocks:
-            assert block.n_samples > 0
-            assert block.counts.shape == (block.n_samples, len(by_name[name].channels))
-            assert block.counts.dtype == kind.counts_dtype(by_name[name])
-            if block.instants_ns is None:
-                assert block.first_sample == end
-            else:  # a busy host polls late: what it left out is said
-                assert block.first_sample >= end
-                assert bool(block.reason) == (block.first_sample > end)
-            assert block.received.monotonic_ns >= at
-            assert block.instants_ns is None or np.all(np.diff(block.instants_ns) > 0)
-            end, at = block.end_sample, block.received.monotonic_ns
+    check_blocks(kind, chosen, found)
+    check_counters(chosen, found)
+    for name, sensor in by_name.items():
+        blocks = [item for item in found if isinstance(item, Block) and item.sensor == name]
+        assert blocks[0].received.monotonic_ns >= begin.monotonic_ns
         counts = np.concatenate([block.counts for block in blocks])
         assert counts.std(axis=0).min() > 0
         index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
@@ -102,9 +89,7 @@ async def test_blocks_are_in_order_and_whole(served: Served, mode: str) -> None:
             assert late.min() >= -EARLY
             assert np.median(late) <= LATENCY
             continue
-        sent = served.sent(mode, name, clock, speed=SPEED)
-        check_counters([by_name[name]], blocks)
-        check_truth(by_name[name], blocks, sent)
+        check_truth(sensor, blocks, served.sent(mode, name, clock, speed=SPEED))
 
 
 @pytest.mark.parametrize("mode", CASES)
@@ -225,24 +210,6 @@ async def test_a_port_that_is_not_there_is_named(served: Served, mode: str) -> N
             await anext(items)
     assert port in str(caught.value)
     assert repr(chosen[0].name) in str(caught.value)
-
-
-@contextlib.asynccontextmanager
-async def stranger(garbage: bytes) -> AsyncIterator[int]:
-    """Yield the number of a port where something listens that is no device."""
-    tasks: list[asyncio.Task[None] | None] = []
-
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
-        with contextlib.suppress(ConnectionError):
-            writer.write(garbage)
-            while await reader.read(4096):
-                writer.write(garbage)
-        writer.transport.abort()
-
-    async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
-        yield server.sockets[0].getsockname()[1]
-    await asyncio.gather(*filter(None, tasks))
 
 
 async def outcome(mode: str, chosen: list[Sensor]) -> tuple[Exception | None, int]:
