@@ -34,6 +34,8 @@ SHARED = ((4.0, 2.0, 0.0), (0.0, 1.0, 3.0))
 UVW = np.array([[2, 0, 2**0.5], [-1, 3**0.5, 2**0.5], [-1, -(3**0.5), 2**0.5]]) / 6**0.5
 INDEPENDENT, WITHIN, RANK_TWO, ELEMENT = "none", "one sensor", "rank two", "one UVW element"
 PAIR = "two sensors"
+TURNING, STEEP, LINES = "turning motion", "steep motion", "lines"
+"""Motion that differs between bins: in its polarisation, by 60 dB over the band, in three bins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +82,28 @@ def scene(cell: Cell, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]
     return loadings, noise
 
 
+def path(cell: Cell, rng: np.random.Generator) -> ComplexArray:
+    """Return how d sources move d axes at each bin, shape (N_BINS, d, d)."""
+    d = cell.d
+    along = np.broadcast_to(np.eye(d, dtype=np.complex128), (N_BINS, d, d)).copy()
+    if cell.shared == TURNING:
+        taps = rng.standard_normal((24, d, d)) * np.exp(-np.arange(24) / 6)[:, None, None]
+        delay = np.exp(-1j * np.linspace(0.2, 2.4, N_BINS)[:, None] * np.arange(24))
+        along = np.einsum("fk,kab->fab", delay, taps)
+        along /= np.linalg.norm(along) / np.sqrt(d * N_BINS)
+    elif cell.shared == STEEP:
+        along *= np.geomspace(30, 0.03, N_BINS)[:, None, None]
+    elif cell.shared == LINES:
+        along[[5, 20, 33], :, 0] += 40 * rng.standard_normal((3, d))
+    return along
+
+
 def bound(loadings: FloatArray, noise: FloatArray, d: int, averages: float) -> FloatArray:
     """Return the Cramér-Rao bound of the diagonal of the noise: standard deviations, shape (p,).
 
-    The noise is any block-diagonal matrix, and the loadings are unknown. By derivatives of the
-    covariance along every real parameter, of which the information is ``n tr(C D C E)``, with C the
-    inverse covariance.
+    The noise is any block-diagonal matrix, and the loadings are unknown, alike at all bins. By
+    derivatives of the covariance along every real parameter, of which the information is
+    ``n tr(C D C E)``, with C the inverse covariance.
     """
     p = len(noise)
     inverse = np.linalg.inv(loadings @ loadings.T + noise)
@@ -117,8 +135,8 @@ def study(cell: Cell, n_draws: int, *, seed: int = 46) -> Found:
     for draw in range(n_draws):
         rng = np.random.default_rng([seed, draw, cell.n_sensors, cell.d, cell.n])
         loadings, noise = scene(cell, rng)
-        csm = np.broadcast_to(loadings @ loadings.T + noise, (N_BINS, *noise.shape))
-        drawn = averaged(csm.astype(np.complex128), cell.n, rng)
+        A = loadings @ path(cell, rng)
+        drawn = averaged(A @ A.conj().swapaxes(1, 2) + noise, cell.n, rng)
         dims, block = (cell.d,) * cell.n_sensors, np.zeros(N_BINS, np.int64)
         options: dict[str, Any] = {}
         reach = np.ones((2, len(noise)))
@@ -161,7 +179,8 @@ def main(n_draws: int, layouts: tuple[tuple[int, int], ...], averages: tuple[int
     print("|---|---|---|" + "---|" * len(RATIOS))
     for (s, d), n in product(layouts, averages):
         shared = (INDEPENDENT, WITHIN, RANK_TWO, ELEMENT)[: 1 if d == 1 else 2 if d == 2 else 4]
-        for kind in (*shared, *(() if s == 3 else (PAIR,))) if n > s * d else ():
+        kinds = *shared, *(() if s == 3 else (PAIR,)), TURNING, STEEP, LINES
+        for kind in kinds if n > s * d else ():
             draws = max(2, -(-n_draws * 9 // (s * d)))
             cells = [study(Cell(s, d, ratio, n, kind), draws) for ratio in RATIOS]
             row = [f"{c.coverage:.3f} {c.named if kind == PAIR else c.width:.2f}" for c in cells]

@@ -7,10 +7,13 @@ neighbouring bins, and its scatter would contain the cost. Project, then pool:
    neighbours that are worth `ENOUGH` averages.
 2. r of the q dimensions of the motion are *resolved*: their eigenvalues in the median sub-block
    stand out, whichever sensor is left out, and apart from the next ones. Their directions are taken
-   from each sub-block, so that a response may vary over the block however strong the motion is;
-   where a line of one sensor stands out like motion, from the nearest other sub-block.
-3. The other q - r directions are taken from the mean of the projected sub-blocks, one set for the
-   block. A response that varies leaks little there: SNR times the square of its variation.
+   from each sub-block, so that a response may vary over the block however strong the motion is.
+   Where one does not stand out, or a line of one sensor does like motion, it is taken from the
+   nearest other sub-block.
+3. Directions of the others are those of the mean of the projected sub-blocks, one set for the
+   block. A response that varies leaks little there: SNR times the square of its variation. The
+   set has up to q, since resolved directions may turn from one sub-block to the next; each takes
+   the q - r of which its projection keeps most.
 4. With Q_b the projector off both in sub-block b, whitened by the noise, the noise of a bin is
    linear in its matrix X. The noise of a sensor is a matrix, as in the paper's formula: what only
    its own channels share is noise, and no dimension of the motion. The elements B_cd of these
@@ -89,6 +92,7 @@ SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of the log of the noise in one round
 _FLOOR = 1e-7  # of the noise over the PSD
+_TINY = 1e-300
 _SINGULAR = 1e-15  # of the PSD, added before the inverse at first
 _BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
 _TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
@@ -363,32 +367,26 @@ def _fitted(
     r, wanted = np.zeros(len(q), np.int64), q
     at_most = np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
+    last, settled = np.full(len(q), np.inf), np.zeros(len(q), np.bool_)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own], sensor)
-        U = np.zeros((len(own), p, 0), np.complex128)
-        P = np.broadcast_to(np.eye(p, dtype=np.complex128), X.shape)
-        g = np.ones(len(own))
+        U, taken = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own))
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
-            U = _leading(_axes(X, int(r.max())), r[own])
-            P = P - U @ U.conj().swapaxes(1, 2)
-            source = _nearest(P, parts, sensor)
-            P, U = P[source], U[source]
-            # directions take noise of the samples they are from, and let motion of others pass
-            g = N / np.where(source == np.arange(len(own)), N - r[own], N + r[own])
+            U, taken = _resolved(X, r, parts, sensor)
+        P, g = np.eye(p) - U @ U.conj().swapaxes(1, 2), N / (N - taken)
         rest = without(X, U)
-        T = parts.mean(g[:, None, None] * rest) if resolve else X
-        A = _axes(T, int((at_most - r).max()))
         kept = parts.mean(P)
-        q = r + _shown(T, A, kept, resolved=r, wanted=at_most, averages=whole, sensor=sensor)
-        weak = q - r
-        Q = P
+        T = parts.mean(g[:, None, None] * rest) if resolve else X
+        filled = T + np.eye(p) - kept  # with the noise that resolved directions take
+        A = _axes(filled, int(at_most.max()))
+        shown = _shown(T, A, kept, resolved=r, wanted=at_most + r, averages=whole, sensor=sensor)
+        weak = np.minimum(shown, at_most - r)
+        q, Q = r + weak, P
         if weak.any():
-            PA = P @ _leading(A, weak)[own]
-            gram = PA.conj().swapaxes(1, 2) @ PA
-            unused = (np.einsum("bii->bi", gram) == 0).astype(float)
-            gram += unused[:, :, None] * np.eye(gram.shape[1])
-            PA = PA @ np.linalg.inv(np.linalg.cholesky(gram)).conj().swapaxes(1, 2)
+            power = np.maximum((A.conj() * (filled @ A)).real.sum(axis=1) - 1, _FLOOR)
+            A = _leading(A * np.sqrt(power)[:, None], shown)
+            PA = _strongest(P @ A[own], weak[own])
             Q, U = P - PA @ PA.conj().swapaxes(1, 2), np.concatenate([U, PA], axis=2)
             rest = without(X, U)
         loss = 1 + weak / np.maximum(whole - q, 1.0)
@@ -399,6 +397,10 @@ def _fitted(
         floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
         size, axes = axes_of(noise, floor, sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
+        change = np.abs(step).max(axis=1)
+        # a weak dimension may turn ever more into one sensor's noise, which then seems to vanish
+        settled |= (change > last) & (turn > 1)
+        step[settled], last = 0, change
         if turn == ROUNDS - 1 or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
             break
         shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
@@ -507,17 +509,46 @@ def _leading(axes: ComplexArray, number: IntArray) -> ComplexArray:
     return np.asarray(axes[:, :, axes.shape[2] - most :] * kept[:, None])
 
 
-def _nearest(P: ComplexArray, parts: _Parts, sensor: IntArray) -> IntArray:
-    """Return the sub-block of the same block from which each takes the directions of the motion.
+def _strongest(V: ComplexArray, number: IntArray) -> ComplexArray:
+    """Return so many left singular vectors of the largest singular values; others are zero."""
+    w, turn = np.linalg.eigh(V.conj().swapaxes(1, 2) @ V)
+    turn = turn * (np.arange(w.shape[1])[::-1] < number[:, None])[:, None]
+    return np.asarray(V @ (turn / np.sqrt(np.maximum(w, _TINY))[:, None]))
 
-    Its own, unless its directions take noise of one sensor almost whole: a line of that sensor
-    stands out in one sub-block, not in the median one, and what is left would be magnified.
+
+def _resolved(
+    X: ComplexArray, r: IntArray, parts: _Parts, sensor: IntArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Return directions of resolved dimensions in each sub-block, and averages that they take.
+
+    Its own where they stand out. The others are those of the nearest sub-block of its block where
+    all stand out. So are all of them where its own take noise of one sensor almost whole: a line of
+    that sensor stands out in one sub-block, not in the median one, and what is left would be
+    magnified. Directions of other samples let motion of theirs pass.
     """
-    own = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
-    least = [np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own]
-    kept: FloatArray = np.min(np.array(least, np.float64), axis=0)
+    p, number = X.shape[1], r[parts.block]
+    U = _leading(_axes(X, int(r.max())), number)
+    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[parts.block] / parts.averages)) ** 2
+    own = (U.conj() * (X @ U)).real.sum(axis=1) > edge[:, None]
+    mine = U * own[:, None]
+    P = np.eye(p) - mine @ mine.conj().swapaxes(1, 2)
+    of = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
+    kept = np.min([np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in of], axis=0)
     usual = np.array([median(each) for each in np.split(kept, parts.first[1:])])
-    seen = kept >= HIDES * usual[parts.block]
+    line = kept < HIDES * usual[parts.block]
+    n_own = np.where(line, 0, own.sum(axis=1))
+    whole = n_own == number
+    whole |= ~np.logical_or.reduceat(whole, parts.first)[parts.block]
+    at = np.flatnonzero(~whole)
+    if len(at):
+        mine, theirs = np.where(line[at, None, None], 0, mine[at]), U[_nearest(whole, parts)[at]]
+        rest = theirs - mine @ (mine.conj().swapaxes(1, 2) @ theirs)
+        U[at] = mine + _strongest(rest, number[at] - n_own[at])[:, :, ::-1]
+    return U, np.where(whole, number, np.where(line, -number, n_own)).astype(float)
+
+
+def _nearest(seen: BoolArray, parts: _Parts) -> IntArray:
+    """Return the nearest sub-block of the same block that is `seen`; each block has one."""
     at, far = np.arange(len(seen)), 2 * len(seen)
     last = np.append(parts.first[1:], len(seen))[parts.block] - 1
     before = np.maximum.accumulate(np.where(seen, at, -1))

@@ -105,6 +105,58 @@ def test_what_the_channels_of_one_sensor_share_is_its_noise(sensors: int, snr: f
     np.testing.assert_allclose(np.mean(ratios, axis=0), 1.0, atol=0.02)
 
 
+TURNING, STEEP, STEP, LINES = "turning", "steep", "a step", "lines"
+
+
+def coloured(kind: str, rng: np.random.Generator) -> ComplexArray:
+    """Return how three sources move three axes at each bin, shape (N_BINS, 3, 3)."""
+    path = np.broadcast_to(np.eye(3, dtype=np.complex128), (N_BINS, 3, 3)).copy()
+    if kind == TURNING:  # filters of a few taps
+        taps = rng.standard_normal((24, 3, 3)) * np.exp(-np.arange(24) / 6)[:, None, None]
+        turned = np.exp(-1j * np.linspace(0.2, 2.4, N_BINS)[:, None] * np.arange(24))
+        path = np.einsum("fk,kab->fab", turned, taps)
+    elif kind == STEEP:  # 60 dB over the band
+        path *= np.geomspace(30, 0.03, N_BINS)[:, None, None]
+    elif kind == STEP:
+        path[30:] *= 0.01
+    else:  # of machines, each along one axis of its own
+        for place in (10, 33, 50):
+            path[place, :, 0] += 40 * rng.standard_normal(3)
+    return path / (np.linalg.norm(path) / np.sqrt(3 * N_BINS) if kind == TURNING else 1)
+
+
+@pytest.mark.parametrize("sensors", [3, 5])
+@pytest.mark.parametrize(
+    ("kind", "ratio"),
+    [(TURNING, 1.0), (TURNING, 3.0), (TURNING, 10.0), (STEEP, 1.0), (STEP, 3.0), (LINES, 1.0)],
+)
+def test_motion_that_differs_between_bins_is_removed(sensors: int, kind: str, ratio: float) -> None:
+    """Where a bin lacks a direction, neither its noise is taken off, nor is motion left in."""
+    scores: list[FloatArray] = []
+    held: list[FloatArray] = []
+    for seed in range(6):
+        rng = np.random.default_rng([seed, sensors])
+        axes = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(sensors)]
+        A = np.sqrt(ratio) * np.concatenate(axes) @ coloured(kind, rng)
+        found = pooled_noise(
+            drawn(rng, A @ A.conj().swapaxes(1, 2) + np.eye(3 * sensors), 300),
+            np.zeros(N_BINS, np.int64),
+            np.full(N_BINS, 3),
+            dims=(3,) * sensors,
+            n_effective=300,
+            correlation=ONE,
+        )
+        level = band_levels(found.noise, found.cumulants, EDGES, ONE)
+        low, high = level.interval()
+        held.append((low[0] <= 1) & (high[0] >= 1))
+        scores.append((level.mean[0] - 1) / level.spread[0])
+    n = 18 * sensors
+    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / n)
+    # 6 draws of channels that hardly depend on one another
+    assert np.square(scores).mean() < 1 + 4 * np.sqrt(2 / n)
+    assert abs(np.mean(scores)) < 4 / np.sqrt(n)
+
+
 def test_each_block_has_the_dimensions_of_its_own_motion() -> None:
     """Strong motion, none, and motion again: none of it is in the noise of its neighbours."""
     rng = np.random.default_rng(3)
