@@ -21,6 +21,7 @@ from daq.devices.interface import (
 )
 from daq.host_clock import HostClock
 from daq.protocols.block import Block, DeviceItem, HostTime
+from daq.recorder.connection import Connection, Item
 
 RATE = 100.0
 
@@ -156,3 +157,17 @@ def counts(first: int, n: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]
 def block(sensor: str, first: int, n: int, at: HostTime, **rest: Any) -> Block:  # noqa: ANN401
     """Return a block of such counts."""
     return Block(sensor, first, counts(first, n), at, **rest)
+
+
+@contextlib.asynccontextmanager
+async def run(connection: Connection) -> AsyncIterator[asyncio.Queue[Item]]:
+    """Keep a connection while the context lasts; yields what it says."""
+    queue: asyncio.Queue[Item] = asyncio.Queue()
+    go = asyncio.Event()
+    go.set()
+    running = asyncio.create_task(connection.run(queue, go))
+    try:
+        yield queue
+    finally:
+        running.cancel()
+        await asyncio.wait([running])

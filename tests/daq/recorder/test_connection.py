@@ -29,6 +29,7 @@ from tests.scripted_driver import (
     PlayedSession,
     bench,
     block,
+    run,
 )
 
 pytestmark = pytest.mark.virtual_time
@@ -63,13 +64,9 @@ async def test_a_stall_is_reported_before_the_driver_closes_its_session() -> Non
     device = PlayedDevice()
     driver = SlowToLeave({"A": device})
     connection = Connection(driver, bench("A").sensors, ManualClock())
-    queue: asyncio.Queue[Item] = asyncio.Queue()
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
     device.items.put_nowait(NoAnswerError("no samples"))
     kinds: list[str] = []
-    async with asyncio.timeout(60):
+    async with run(connection) as queue, asyncio.timeout(60):
         while "stalled" not in kinds:
             item = await queue.get()
             kinds += _kind(item)
@@ -79,8 +76,6 @@ async def test_a_stall_is_reported_before_the_driver_closes_its_session() -> Non
         while kinds.count("connected") < 2:
             item = await queue.get()
             kinds += _kind(item)
-    running.cancel()
-    await asyncio.wait([running])
     assert kinds == ["connected", "stalled", "connected"]
 
 
@@ -98,20 +93,14 @@ async def test_delays_grow_for_a_device_that_connects_only_briefly() -> None:
     device, clock = PlayedDevice(), ManualClock()
     driver = PlayedDriver({"A": device})
     connection = Connection(driver, bench("A").sensors, clock)
-    queue: asyncio.Queue[Item] = asyncio.Queue()
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
     loop, opened = asyncio.get_running_loop(), []
-    async with asyncio.timeout(20):
+    async with run(connection), asyncio.timeout(20):
         for _ in range(4):
             await device.opened.wait()
             device.opened.clear()
             opened.append(loop.time())
             device.items.put_nowait(block("A", 0, 10, clock.now()))
             device.items.put_nowait(NoAnswerError("gone again"))
-    running.cancel()
-    await asyncio.wait([running])
     assert np.diff(opened) == pytest.approx([0.2, 0.4, 0.8])
 
 
@@ -143,18 +132,13 @@ async def kinds_of(
 ) -> list[str]:
     """Return what is said of a device that sends a block after each pause, connected or not."""
     connection = Connection(driver, bench("A").sensors, clock)
-    queue: asyncio.Queue[Item] = asyncio.Queue()
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
-    await device.opened.wait()
-    for n, pause in enumerate(pauses):
-        await asyncio.sleep(pause)
-        clock.advance(pause)
-        device.items.put_nowait(block("A", 10 * n, 10, clock.now()))
-    await asyncio.sleep(0.01)
-    running.cancel()
-    await asyncio.wait([running])
+    async with run(connection) as queue:
+        await device.opened.wait()
+        for n, pause in enumerate(pauses):
+            await asyncio.sleep(pause)
+            clock.advance(pause)
+            device.items.put_nowait(block("A", 10 * n, 10, clock.now()))
+        await asyncio.sleep(0.01)
     return [kind for item in iter_queue(queue) for kind in _kind(item)]
 
 
@@ -204,25 +188,20 @@ async def test_learned_intervals_are_passed_to_the_next_session() -> None:
     driver = driver_with(device, 1.0)
     clock = ManualClock()
     connection = Connection(driver, bench("A").sensors, clock)
-    queue: asyncio.Queue[Item] = asyncio.Queue()
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
-    n_blocks = 0
-    for pause in (0.1, 0.9, 0.9, 0.9):
-        await asyncio.sleep(pause)
-        device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
-        n_blocks += 1
-    await asyncio.sleep(0.01)
-    device.items.put_nowait(NotConnectedError("cable"))
-    await asyncio.sleep(1.0)
-    for pause in (0.1, 1.7, 0.1):  # twice the interval before, beyond what the session states
-        await asyncio.sleep(pause)
-        device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
-        n_blocks += 1
-    await asyncio.sleep(0.01)
-    running.cancel()
-    await asyncio.wait([running])
+    async with run(connection):
+        n_blocks = 0
+        for pause in (0.1, 0.9, 0.9, 0.9):
+            await asyncio.sleep(pause)
+            device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
+            n_blocks += 1
+        await asyncio.sleep(0.01)
+        device.items.put_nowait(NotConnectedError("cable"))
+        await asyncio.sleep(1.0)
+        for pause in (0.1, 1.7, 0.1):  # twice the interval before, beyond what the session states
+            await asyncio.sleep(pause)
+            device.items.put_nowait(block("A", 10 * n_blocks, 10, clock.now()))
+            n_blocks += 1
+        await asyncio.sleep(0.01)
     assert device.n_sessions == 2
 
 
@@ -235,13 +214,9 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
     driver = PlayedDriver({"A": device})
     connection = Connection(driver, bench("A").sensors, clock)
     clock.suspended = -0.2  # a busy computer was held up between its two clocks
-    queue: asyncio.Queue[Item] = asyncio.Queue()
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
     said: list[Event] = []
     n_blocks = 0
-    async with asyncio.timeout(60):
+    async with run(connection) as queue, asyncio.timeout(60):
         device.items.put_nowait(block("A", 0, 5, clock.now()))
         while n_blocks < 1:
             n_blocks += isinstance(await queue.get(), Block)
@@ -259,8 +234,6 @@ async def test_a_suspended_computer_ends_the_session_of_a_device_that_does_not_c
             event = item.event if isinstance(item, SensorLate | SensorLost) else item
             if isinstance(event, Event) and event.kind != "connected":
                 said.append(event)
-    running.cancel()
-    await asyncio.wait([running])
     assert device.n_sessions == (2 if counter is None else 1)
     assert [event.kind for event in said] == ["stalled" if counter is None else "status"]
     assert "the computer was suspended for 37" in said[0].text

@@ -10,7 +10,7 @@ from daq.errors import NotConnectedError
 from daq.protocols.block import Event
 from daq.recorder.connection import Connected, Connection, Item, SensorLost
 from daq.transport.serial_ports import SerialPort
-from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block
+from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, run
 
 pytestmark = pytest.mark.virtual_time
 
@@ -53,29 +53,24 @@ async def until_connected(queue: asyncio.Queue[Item]) -> list[Item]:
     return items
 
 
-async def run(usb: Usb, serial_number: str = "1") -> tuple[Connection, asyncio.Queue[Item]]:
+def connection_of(usb: Usb, serial_number: str = "1") -> Connection:
     device = PlayedDevice(serial_number=serial_number)
     usb.plug("/dev/ttyUSB0", usb.ports.get("/dev/ttyUSB0", FTDI_1), device)
     sensors = bench("A", A="/dev/ttyUSB0").sensors
-    connection = Connection(usb.driver, sensors, ManualClock(), find_ports=usb.find)
-    return connection, asyncio.Queue()
+    return Connection(usb.driver, sensors, ManualClock(), find_ports=usb.find)
 
 
-async def moved_to(usb: Usb, connection: Connection, queue: asyncio.Queue[Item]) -> list[Item]:
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
-    await until_connected(queue)
-    device = usb.pull("/dev/ttyUSB0")
-    device.items = asyncio.Queue()
-    await asyncio.sleep(3.0)
-    usb.plug("/dev/ttyUSB1", FTDI_1 if usb.ports.pop("same", "") else FTDI_2, device)
-    async with asyncio.timeout(60):
-        items = await until_connected(queue)
-        device.items.put_nowait(block("A", 0, 10, ManualClock().now()))
-        items.append(await queue.get())
-    running.cancel()
-    await asyncio.wait([running])
+async def moved_to(usb: Usb, connection: Connection) -> list[Item]:
+    async with run(connection) as queue:
+        await until_connected(queue)
+        device = usb.pull("/dev/ttyUSB0")
+        device.items = asyncio.Queue()
+        await asyncio.sleep(3.0)
+        usb.plug("/dev/ttyUSB1", FTDI_1 if usb.ports.pop("same", "") else FTDI_2, device)
+        async with asyncio.timeout(60):
+            items = await until_connected(queue)
+            device.items.put_nowait(block("A", 0, 10, ManualClock().now()))
+            items.append(await queue.get())
     return items
 
 
@@ -87,15 +82,13 @@ async def test_the_same_adapter_is_found_under_another_name() -> None:
     """Its sensor has no serial number: the adapter's identity is enough."""
     usb = Usb(ttyUSB0=FTDI_1)
     usb.ports["same"] = "yes"
-    connection, queue = await run(usb, serial_number="")
-    items = await moved_to(usb, connection, queue)
+    items = await moved_to(usb, connection_of(usb, serial_number=""))
     assert texts(items) == ["on /dev/ttyUSB1"]
 
 
 async def test_another_adapter_is_accepted_if_the_serial_number_matches() -> None:
     usb = Usb(ttyUSB0=FTDI_1)
-    connection, queue = await run(usb)
-    items = await moved_to(usb, connection, queue)
+    items = await moved_to(usb, connection_of(usb))
     assert texts(items) == ["on /dev/ttyUSB1 1"]
 
 
@@ -104,25 +97,21 @@ async def test_another_device_on_a_new_port_is_refused(serial_number: str) -> No
     usb = Usb(ttyUSB0=FTDI_1, ttyUSB5="0403:6001 FT5")
     stranger, other = PlayedDevice(serial_number=serial_number), PlayedDevice(serial_number="1")
     usb.driver.devices["/dev/ttyUSB5"] = other  # there before: another sensor may have it
-    connection, queue = await run(usb)
-    go = asyncio.Event()
-    go.set()
-    running = asyncio.create_task(connection.run(queue, go))
-    await until_connected(queue)
-    device = usb.pull("/dev/ttyUSB0")
-    usb.plug("/dev/ttyUSB3", FTDI_2, stranger)
-    await asyncio.sleep(30.0)
-    assert stranger.n_sessions > 0
-    assert other.n_sessions == 0
-    assert connection.information[0].serial_number == "1"
-    said = [queue.get_nowait() for _ in range(queue.qsize())]
-    assert not any(isinstance(item, Connected) for item in said)
-    lost = [item.event.text for item in said if isinstance(item, SensorLost)]
-    assert len(lost) == 2
-    device.items = asyncio.Queue()
-    usb.plug("/dev/ttyUSB0", FTDI_1, device)
-    async with asyncio.timeout(60):
-        items = await until_connected(queue)
-    assert texts(items) == ["on /dev/ttyUSB0 1"]
-    running.cancel()
-    await asyncio.wait([running])
+    connection = connection_of(usb)
+    async with run(connection) as queue:
+        await until_connected(queue)
+        device = usb.pull("/dev/ttyUSB0")
+        usb.plug("/dev/ttyUSB3", FTDI_2, stranger)
+        await asyncio.sleep(30.0)
+        assert stranger.n_sessions > 0
+        assert other.n_sessions == 0
+        assert connection.information[0].serial_number == "1"
+        said = [queue.get_nowait() for _ in range(queue.qsize())]
+        assert not any(isinstance(item, Connected) for item in said)
+        lost = [item.event.text for item in said if isinstance(item, SensorLost)]
+        assert len(lost) == 2
+        device.items = asyncio.Queue()
+        usb.plug("/dev/ttyUSB0", FTDI_1, device)
+        async with asyncio.timeout(60):
+            items = await until_connected(queue)
+        assert texts(items) == ["on /dev/ttyUSB0 1"]
