@@ -373,12 +373,13 @@ class Pass:
 
         `live` segments come one by one: their delays are measured later, a few at a time.
         """
-        hop, at_once = self.welch.hop, self._at_once
-        total = self.n_complete if most is None else min(most, self.n_complete)
-        begin = self.n_seen
-        bounds = [begin, *range(begin + max(at_once, self._delays.fewest), total, at_once), total]
+        hop, begin, n_complete = self.welch.hop, self.n_seen, self.n_complete
+        total = n_complete if most is None else min(most, n_complete)
         if self._ends is not None and not begin:  # as many as the recording has now
             self._ends.every = max(1, -(-total // MOST))
+            while (n_complete - 1) // self._ends.every > MOST:  # as they would be merged later
+                self._ends.every *= 2
+        bounds = [begin, *self._cuts(begin + max(self._at_once, self._delays.fewest), total), total]
         pieces = [(a, b - a) for a, b in itertools.pairwise(bounds) if a < b]
 
         source = self._newest if live and len(pieces) == 1 else self.aligned
@@ -390,14 +391,14 @@ class Pass:
             if source is self.aligned and not on_grid:
                 found = self._own_spectra((first + np.arange(count)) * hop)
                 if found is not None:
-                    return replace(found, products=self._all.products(found.spectra))
+                    return replace(found, products=self._products(found.spectra, first))
             part = self._read(source, self.filters, first * hop, count)
             is_small = count * self.welch.segment_length * self.n_channels <= MOST_VALUES
             if live or not is_small or self.octaves is not None or self._undisturbed is not None:
                 return part
             # in this thread: the one that adds them is waited for
             spectra = self._all.transforms(part.samples, np.arange(count) * hop)
-            return replace(part, spectra=spectra, products=self._all.products(spectra))
+            return replace(part, spectra=spectra, products=self._products(spectra, first))
 
         for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
             if isinstance(part, OwnSpectra):
@@ -407,6 +408,25 @@ class Pass:
             self.n_seen += count
             if progress is not None:
                 progress(count)
+
+    def _cuts(self, begin: int, total: int) -> list[int]:
+        """Return where pieces end, from `begin` on: also where parts of time do, if these are long.
+
+        A piece within one part is added whole, by the sum of its products.
+        """
+        at_once = self._at_once
+        every = at_once if self._ends is None else self._ends.every
+        n = -(-every // at_once)  # pieces of a part
+        some = range(-(-begin * n // every), total * n // every + 1)
+        ends = [each * every // n for each in some] if every > at_once else []
+        return [end for end in ends or range(begin, total, at_once) if end < total]
+
+    def _products(self, spectra: ComplexArray, first: int) -> FloatArray | None:
+        """Return the sum of products of segments from number `first` on, if one part has them."""
+        every = 0 if self._ends is None else self._ends.every
+        if every and first // every != (first + len(spectra) - 1) // every:
+            return None
+        return self._all.products(spectra)
 
     def finish(
         self,
