@@ -50,7 +50,9 @@ def main() -> int:
     sensors = [SensorLayout(name, channels, 100.0, np.dtype("i4")) for name in SENSORS]
     rng = np.random.default_rng(1)
     try:
-        writer = RecordingWriter.create(path, sensors=sensors, created=CREATED)
+        writer = RecordingWriter.create(
+            path, sensors=sensors, created=CREATED, control=(7, "token")
+        )
         first = 0
         for number in range(commits):
             n = int(rng.integers(1, 300))
