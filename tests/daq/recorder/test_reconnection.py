@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ from daq.recorder.recorder import RecorderStatus, record
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from daq.recording.sensor_state import SensorState
+from sim_devices.server.launch import RunningDevice
 from tests.acceptance.sample_accounting import Log, accounts
-from tests.daq.recorder.test_recorder_process import started
-from tests.devices import host_clock
+from tests.devices import host_clock, serving
 from tests.sim_devices.simulated_bench import bench_of, device, sensors, spec
 
 pytestmark = pytest.mark.devices
@@ -49,6 +50,14 @@ def table(name: str, driver: str) -> dict[str, Any]:
     if driver == "epson":
         return device(name, channels={name: EPSON})
     return device(name, driver, port="tcp", channels={name: LABJACK})
+
+
+@contextlib.asynccontextmanager
+async def started(told: dict[str, Any]) -> AsyncIterator[tuple[RunningDevice, ...]]:
+    """Start devices without holding up the recorder in this process."""
+    with contextlib.ExitStack() as stack:
+        yield await asyncio.to_thread(stack.enter_context, serving(told))
+        await asyncio.to_thread(stack.close)
 
 
 async def test_gaps_are_exact_if_the_device_continued_to_count(tmp_path: Path) -> None:
