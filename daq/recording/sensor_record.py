@@ -4,7 +4,7 @@ A long recording has millions of blocks. Rows stay in the file and are read on d
 newest rows and the clipped stretches are kept in memory, since they are needed repeatedly.
 
 Many small chunks of a dataset are read together, also from several threads. HDF5 takes longer to
-fetch a small chunk than to read it. So where a file is closed, the raw chunks are located once, and
+fetch a small chunk than to inflate it. So where a file is closed, its chunks are located once, and
 read from the file as they are, many at a time. Checksums are of blocks, so the reader of a block
 finds any damage.
 """
@@ -32,6 +32,7 @@ from daq.recording.storage.packing import PIPELINE, RAW, InflationError, check_c
 from daq.recording.storage.refusals import check_length, dataset, number, text
 
 IntArray = NDArray[np.int64]
+Buffer = bytes | memoryview
 
 
 _ROWS_PER_READ = 1 << 14  # 900 kB
@@ -187,11 +188,12 @@ class BlockTable:
 
 
 _KEPT_BYTES = 1 << 20  # of the last read: short recordings are read several times
+_SPARSE = 4  # bytes of the file over those of chunks, from which each chunk is read alone
 _LOCATED_FROM = 1 / 16  # share of the chunks that is fetched before all are located
 
 
-class RawChunks:
-    """Reads chunks that went through no filter from the file itself.
+class LocatedChunks:
+    """Reads chunks as they are stored from the file itself.
 
     Parameters
     ----------
@@ -203,18 +205,44 @@ class RawChunks:
         self._file, self._length = dataset.file.id, dataset.chunks[0]
         row_bytes = dataset.dtype.itemsize * int(np.prod(dataset.chunks[1:]))
         self._n_bytes = self._length * row_bytes
-        self._at = np.full(-(-len(dataset) // self._length), -1, np.int64)
-        """Byte of the file at which each chunk begins; -1 for one that is not raw."""
+        self._stored = np.full((-(-len(dataset) // self._length), 3), -1, np.int64)
+        """Byte of the file at which each chunk begins, its bytes and its mask; -1 if unknown."""
         file = dataset.file
         if file.driver == "sec2" and not file.userblock_size and hasattr(os, "preadv"):
             dataset.id.chunk_iter(self._note)
+        at, size, mask = self._stored.T
+        self._raw_at = np.where((mask == RAW) & (size == self._n_bytes), at, -1)
 
     def _note(self, chunk: Any) -> None:  # noqa: ANN401 - h5py names no type
-        if chunk.filter_mask == RAW and chunk.size == self._n_bytes:
-            self._at[chunk.chunk_offset[0] // self._length] = chunk.byte_offset
+        number = chunk.chunk_offset[0] // self._length
+        self._stored[number] = chunk.byte_offset, chunk.size, chunk.filter_mask
+
+    def stored(self, first: int, n_chunks: int) -> list[tuple[int, Buffer]] | None:
+        """Return mask and bytes of chunks, from chunk `first` on; None if not all are known.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be read.
+        """
+        at, size, mask = self._stored[first : first + n_chunks].T
+        if len(at) < n_chunks or (at < 0).any() or (size > 2 * self._n_bytes).any():
+            return None
+        handle, begin, end = self._file.get_vfd_handle(), int(at.min()), int((at + size).max())
+        found: list[Buffer]
+        if end - begin <= _SPARSE * int(size.sum()):
+            whole = memoryview(os.pread(handle, end - begin, begin))
+            edges = zip((at - begin).tolist(), (at + size - begin).tolist(), strict=True)
+            found = [whole[low:high] for low, high in edges]
+        else:
+            places = zip(at.tolist(), size.tolist(), strict=True)
+            found = [os.pread(handle, n, place) for place, n in places]
+        if sum(map(len, found)) < int(size.sum()):
+            return None
+        return list(zip(mask.tolist(), found, strict=True))
 
     def read(self, first: int, rows: NDArray[Any]) -> bool:
-        """Put the contents of chunks, from chunk `first` on, into rows; return False if not all.
+        """Put raw chunks, from chunk `first` on, into rows; return False if not all are raw.
 
         Raises
         ------
@@ -222,7 +250,7 @@ class RawChunks:
             If the file cannot be read.
         """
         plain = rows.view(np.uint8).reshape(-1).data
-        at = self._at[first : first + len(plain) // self._n_bytes]
+        at = self._raw_at[first : first + len(plain) // self._n_bytes]
         if len(at) * self._n_bytes < len(plain) or (at < 0).any():
             return False
         cuts = np.flatnonzero(np.diff(at) != self._n_bytes) + 1
@@ -255,7 +283,7 @@ class ChunkedRows:
         self._checked: set[int] = set()
         """First rows of the chunks that inflate to no more than their size."""
         self._n_fetched = 0
-        self._raw: RawChunks | None = None
+        self._located: LocatedChunks | None = None
         self.is_closed = False
         """Whether the file is closed: its chunks stay where they are."""
 
@@ -330,12 +358,16 @@ class ChunkedRows:
         """Put whole chunks, from row ``start`` of the dataset on, into rows; return if all are."""
         self._n_fetched += len(rows) // self._length
         many = self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset)
-        if self._raw is None and self.is_closed and many:
-            self._raw = RawChunks(self._dataset)
-        if self._raw is not None and self._raw.read(start // self._length, rows):
-            return True
-        fetch, end = self._dataset.id.read_direct_chunk, start + len(rows)
-        stored = [fetch((row, *self._corner)) for row in range(start, end, self._length)]
+        if self._located is None and self.is_closed and many:
+            self._located = LocatedChunks(self._dataset)
+        first, n_chunks, stored = start // self._length, len(rows) // self._length, None
+        if self._located is not None:
+            if self._located.read(first, rows):
+                return True
+            stored = self._located.stored(first, n_chunks)
+        if stored is None:
+            fetch, end = self._dataset.id.read_direct_chunk, start + len(rows)
+            stored = [fetch((row, *self._corner)) for row in range(start, end, self._length)]
         return unpacked(stored, rows)
 
 

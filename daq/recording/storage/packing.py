@@ -63,7 +63,7 @@ def packed(chunk: NDArray[Any]) -> tuple[bytes, int]:
     return stream, _NO_FLETCHER
 
 
-def unpacked(stored: Sequence[tuple[int, bytes]], rows: NDArray[Any]) -> bool:
+def unpacked(stored: Sequence[tuple[int, bytes | memoryview]], rows: NDArray[Any]) -> bool:
     """Put the contents of chunks into rows; return False where HDF5 must read them.
 
     Parameters

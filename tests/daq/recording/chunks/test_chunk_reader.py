@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from daq.recording import sensor_record
-from daq.recording.sensor_record import ChunkedRows, RawChunks
+from daq.recording.sensor_record import ChunkedRows, LocatedChunks
 from daq.recording.storage import packing
 
 LENGTH, N_ROWS = 10, 257
@@ -220,7 +220,7 @@ def test_a_raw_chunk_that_is_cut_off_is_left_to_hdf5(tmp_path: Path) -> None:
     rows = np.random.default_rng(0).integers(-(2**31), 2**31, (N_ROWS, 3)).astype("<i4")
     write_raw(tmp_path / "f.h5", rows)
     with h5py.File(tmp_path / "f.h5", "r") as file:
-        raw = RawChunks(file["rows"])
+        raw = LocatedChunks(file["rows"])
         into = np.empty((LENGTH, 3), "<i4")
         assert raw.read(0, into)
         np.testing.assert_array_equal(into, rows[:LENGTH])
@@ -229,3 +229,33 @@ def test_a_raw_chunk_that_is_cut_off_is_left_to_hdf5(tmp_path: Path) -> None:
         at = file["rows"].id.get_chunk_info(24).byte_offset
         os.truncate(tmp_path / "f.h5", at + 5)
         assert not raw.read(24, into)
+
+
+@pytest.mark.parametrize("sparse", [0.0, 4.0])
+def test_chunks_of_any_kind_are_taken_from_the_file_as_hdf5_gives_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sparse: float
+) -> None:
+    monkeypatch.setattr(sensor_record, "_SPARSE", sparse)  # each alone, or all with what is between
+    write_raw(tmp_path / "f.h5", ramp("<i4", 3))
+    n_chunks = -(-N_ROWS // LENGTH)
+    with h5py.File(tmp_path / "f.h5", "r") as file:
+        located, fetch = LocatedChunks(file["rows"]), file["rows"].id.read_direct_chunk
+        found = located.stored(0, n_chunks)
+        assert found is not None
+        expected = [fetch((LENGTH * number, 0)) for number in range(n_chunks)]
+        assert [(mask, bytes(content)) for mask, content in found] == expected
+        assert located.stored(n_chunks - 1, 2) is None  # beyond the last
+        at = file["rows"].id.get_chunk_info(2).byte_offset
+        os.truncate(tmp_path / "f.h5", at + 5)
+        assert located.stored(2, 1) is None
+
+
+def test_a_chunk_far_larger_than_its_rows_is_left_to_hdf5(tmp_path: Path) -> None:
+    rows = ramp("<i4", 3)
+    write(tmp_path / "f.h5", rows)
+    with h5py.File(tmp_path / "f.h5", "r+") as file:
+        file["rows"].id.write_direct_chunk((0, 0), bytes(3 * LENGTH * 12), 0b100)
+    with h5py.File(tmp_path / "f.h5", "r") as file:
+        located = LocatedChunks(file["rows"])
+        assert located.stored(0, 1) is None
+        assert located.stored(1, 1) is not None
