@@ -60,8 +60,10 @@ mean."""
 WEAK = 0.4
 """The same, below which motion is no matter where noise is tested."""
 LEFT = 5.0
-"""Changes of the noise of a part, over those of motion that is left beside the directions of a
-band, that this motion may explain: its power is up to twice what channels share of it."""
+"""Changes of the noise of a channel, over those of what channels share, that motion may explain:
+that is less where channels differ."""
+ROUNDS = 8
+"""In which the course of motion that is left is found."""
 CONFIRMED = 0.5
 """Power of a direction at other frequencies, over the least of both, if it is of motion."""
 LEAST_DEGREES = 8.0
@@ -132,7 +134,7 @@ class _Scores:
     def add(
         self, found: Regression, correlation: FloatArray, sensor_of: IntArray | None = None
     ) -> None:
-        """Add frequencies; where `sensor_of` gives the sensor of each channel, also for `left`."""
+        """Add frequencies; with the sensor of each channel, also for motion that is left."""
         n_freqs = len(found.projector)
         at_once = max(1, PAIR_BYTES // (16 * n_freqs * self._n_channels))
         averages = 1 / np.mean(1 / found.averages)
@@ -159,18 +161,21 @@ class _Scores:
 
     @property
     def left(self) -> float:
-        """Standard deviation, between parts, of what sensors share; 0 unless that is significant.
+        """Standard deviation between parts of motion that is left; 0 unless that is significant.
 
-        Over the noise, rms of pairs of channels. Noise of two parts is independent; motion has the
-        directions of its frequency in both.
+        Over the noise, as two channels share it, rms of pairs. Noise of two parts is independent;
+        motion has the directions of its frequency in both.
         """
-        n = len(self._products)
-        apart = ~np.eye(n, dtype=np.bool_)
-        total, scatter = self._products[apart].sum(), 2 * self._squares[apart].sum()
-        if not total > SIGNIFICANCE * np.sqrt(scatter):
+        apart = self._products * ~np.eye(len(self._products), dtype=np.bool_)
+        squares = self._squares.sum() - np.trace(self._squares)
+        if not apart.sum() > SIGNIFICANCE * np.sqrt(2 * squares):
             return 0.0
-        by_part = (self._products * apart).sum(axis=1) / (n - 1)
-        return float(by_part.std(ddof=1) / np.sqrt(total / (n * (n - 1)) * self._n_products))
+        course = np.ones(len(apart))
+        for _ in range(ROUNDS):
+            course = apart @ course / (course @ course - course**2)
+            course /= course.mean()
+        power = course @ apart @ course / ((course @ course) ** 2 - (course**4).sum())
+        return float(np.sqrt(max(power, 0.0) / self._n_products) * course.std(ddof=1))
 
     def of_parts(self, some: BoolArray) -> _Scores:
         """Return those of some parts."""
@@ -244,11 +249,11 @@ class BandSteadiness:
 
     @property
     def is_of_motion(self) -> bool:
-        """Whether motion that is left may be what changes."""
+        """Whether what changes may be motion that directions leave."""
         if self.levels is None:
             return False
-        more = self.levels.deviation**2 - self.levels.expected**2
-        return bool(0 < more.max() < (LEFT * self.scores.left) ** 2)
+        more = (self.levels.deviation**2 - self.levels.expected**2).max()
+        return bool(0 < more < (LEFT * self.scores.left) ** 2)
 
     @property
     def inflation(self) -> float:

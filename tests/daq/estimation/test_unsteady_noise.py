@@ -93,6 +93,22 @@ def test_motion_of_other_directions_at_each_frequency_is_no_noise_that_changes(s
     assert steady is None or steady.inflation < 1.5
 
 
+def test_bursts_of_motion_that_directions_leave_are_no_noise_that_changes() -> None:
+    """Four parts of eleven have most of it: too few for products of all parts alike."""
+    rng, rate = np.random.default_rng(7), 20.0
+    n = round(900 * rate)
+    motion = 0.6 * rng.standard_normal((n, 3))
+    for first in rng.integers(0, n, 4):
+        motion[first : first + int(rng.uniform(3, 40) * rate)] *= rng.uniform(2, 30)
+    samples = {
+        name: motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        + rng.uniform(0.3, 3) * rng.standard_normal((n, 3))
+        for name in "ABC"
+    }
+    found = huddle.self_noise(samples, fs=rate).snapshot.diagnostics
+    assert NoiseChanges not in [type(each) for each in found.advice]
+
+
 def test_levels_of_bands_whose_noise_is_steady_are_estimated_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
