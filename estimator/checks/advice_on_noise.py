@@ -238,7 +238,8 @@ def _is_large_fall(advice: ResponseChanges) -> bool:
 def _remedy(advice: ResponseChanges) -> str:
     if _is_large_fall(advice):
         return "check its place and its cable"
-    return "fix the sensor" if advice.is_turn else "let the sensor settle"
+    varies = advice.is_turn or advice.band is not None
+    return "fix the sensor" if varies else "let the sensor settle"
 
 
 def _pairs(pairs: tuple[tuple[int, int], ...], names: Names) -> list[str]:

@@ -1,8 +1,17 @@
-"""Segments that are disturbed: their residuals beside the motion stand out."""
+"""Single segments: disturbed ones, and gains that change from one to the next.
+
+A segment is disturbed if its residual beside the motion stands out. A sensor whose gain is by g off
+in a segment leaves g times the motion in its residual, at all frequencies; noise leaves at two
+frequencies what is independent. So products of what the motion explains of residuals, at different
+frequencies, have the mean g², whatever the noise does. Less those of one segment with a later one,
+they show what gains do that no part of time shows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +28,14 @@ DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
 RESTLESS = 3.0
 """Scatter of single segments over that of steady noise, from which none is disturbed."""
+LATER = 2
+"""Segments after which a gain that drifts is the same: those between overlap both."""
+TOGETHER = 4
+"""Segments whose products are averaged before their scatter is measured: neighbours overlap."""
+UNSTABLE = 4.5
+"""Standard errors from which gains change from segment to segment."""
+LARGEST = 0.5
+"""Variance of a gain over the largest of all, from which it is no part of that in the motion."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
 
@@ -45,31 +62,119 @@ class SegmentCourse:
     runs: IntArray
 
 
-def disturbed_segments(
-    course: SegmentCourse, maximum: Maximum, good: BoolArray
-) -> tuple[BoolArray, FloatArray, bool]:
-    """Return which segments are disturbed, the noise they add, and whether others change, too.
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentFindings:
+    """What single segments show.
 
-    The noise has the shape (n_groups, n_channels). Where it changes all the time, at some
-    frequencies, segments are not disturbed.
+    Attributes
+    ----------
+    disturbed : bool, shape (n_segments,)
+    excess : float64, shape (n_groups, n_channels)
+        Noise that these add, as a share.
+    is_restless : bool
+        Whether the noise of others changes from segment to segment, at some frequencies.
+    gains, sure : float64, shape (n_sensors,)
+        Variance of the gains of a sensor between segments, 0 unless significant; over its standard
+        error.
     """
-    there = np.flatnonzero(course.bins < len(good))
-    there = there[good[course.bins[there]]]
-    bins = course.bins[there]
-    none = np.zeros(len(course.spectra), np.bool_), np.zeros((1, maximum.psi.shape[1]))
-    if len(bins) < FREQUENCIES:
-        return *none, False
-    at = maximum.take(bins)
-    groups = np.array_split(np.arange(len(bins)), len(bins) // FREQUENCIES)
+
+    disturbed: BoolArray
+    excess: FloatArray
+    is_restless: bool
+    gains: FloatArray
+    sure: FloatArray
+
+    @classmethod
+    def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
+        """Return findings of segments that show nothing."""
+        disturbed, excess = np.zeros(n_segments, np.bool_), np.zeros((1, sum(dims)))
+        return cls(disturbed, excess, False, *np.zeros((2, len(dims))))
+
+
+def segment_findings(
+    course: SegmentCourse, maximum: Maximum, good: BoolArray, dims: tuple[int, ...]
+) -> SegmentFindings:
+    """Return what segments show at `good` frequencies, shape (n_freqs,).
+
+    Where noise changes all the time, at some frequencies, or gains do, segments are not disturbed.
+    """
+    none = SegmentFindings.none(len(course.spectra), dims)
+    known = np.flatnonzero(course.bins < len(good))
+    known = known[(maximum.converged & ~maximum.singular)[course.bins[known]]]
+    is_good = good[course.bins[known]]
+    there = np.concatenate([known[is_good], known[~is_good]])
+    counts = int(is_good.sum()) // FREQUENCIES, int((~is_good).sum()) // FREQUENCIES
+    if not any(counts):
+        return none
+    at = maximum.take(course.bins[there])
+    both = np.split(np.arange(len(there)), [int(is_good.sum())])
+    groups = [e for some, n in zip(both, counts, strict=True) if n for e in np.array_split(some, n)]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    out, calm = _disturbed(residuals, np.array([own[group].sum() for group in groups]))
-    if not out.any():
-        return *none, not calm.all()
+    gains, power = _Gains(own, groups, dims), []
+    for residual, motion in residuals:
+        power.append((np.abs(residual) ** 2).sum(axis=(1, 2)))
+        gains.add(residual, motion)
+    variance, sure = gains.variance()
+    found = replace(none, gains=variance, sure=sure)
+    groups = groups[: counts[0]]  # of others, noise may seem to be zero
+    if not groups:
+        return found
+    degrees = np.array([own[group].sum() for group in groups])
+    out, calm = _disturbed(np.stack(power[: counts[0]], axis=1), degrees)
+    found = replace(found, is_restless=not calm.all())
+    if not out.any() or variance.any():
+        return found
     inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
     lack = [1 / np.maximum(1 + excess[group].mean(axis=0), 0.01) - 1 for group in groups]
-    return out, np.stack(lack)[calm], not calm.all()
+    return replace(found, disturbed=out, excess=np.stack(lack)[calm])
+
+
+class _Gains:
+    """Gains of every sensor in every segment, by groups of frequencies.
+
+    Parameters
+    ----------
+    own : float64, shape (n_bins, n_channels)
+        Share of a channel beside the motion.
+    groups : list of int64
+    dims : tuple of int
+    """
+
+    def __init__(self, own: FloatArray, groups: list[IntArray], dims: tuple[int, ...]) -> None:
+        self._own, self._first = [own[group] for group in groups], np.cumsum([0, *dims])[:-1]
+        self._score: list[FloatArray] = []
+        self._weight: list[FloatArray] = []
+
+    def add(self, residual: ComplexArray, motion: ComplexArray) -> None:
+        """Add the next group, of shape (n_segments, n_freqs, n_channels)."""
+        along = (residual * motion.conj()).real.sum(axis=1)
+        known = ((np.abs(motion) ** 2) * self._own[len(self._score)]).sum(axis=1)
+        self._score.append(np.add.reduceat(along, self._first, axis=1))
+        self._weight.append(np.add.reduceat(known, self._first, axis=1))
+
+    def variance(self) -> tuple[FloatArray, FloatArray]:
+        """Return `gains` and `sure` of `SegmentFindings`."""
+        n_sensors, n = len(self._first), len(self._score[0]) - LATER
+        n_blocks = n // TOGETHER
+        found = np.zeros((max(n, 0), n_sensors))
+        if len(self._score) == 1 or n_blocks < TOGETHER:
+            return np.zeros(n_sensors), np.zeros(n_sensors)
+        score, weight = np.stack(self._score), np.stack(self._weight)
+        for sign, later in ((1, 0), (-1, LATER)):
+            along, known = (_across(e[:, :n], e[:, later : later + n]) for e in (score, weight))
+            found += sign * along / known.sum(axis=0)
+        blocks = found[: n_blocks * TOGETHER].reshape(n_blocks, TOGETHER, -1).sum(axis=1)
+        total, sure = found.sum(axis=0), blocks.mean(axis=0) / blocks.std(axis=0, ddof=1)
+        sure *= math.sqrt(n_blocks)
+        is_seen = (sure > UNSTABLE) & (total > LARGEST * total.max())
+        return np.where(is_seen, total, 0.0), sure
+
+
+def _across(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the sum of products of different groups, the first axis."""
+    return np.asarray(one.sum(axis=0) * other.sum(axis=0) - (one * other).sum(axis=0))
 
 
 class _Residuals:
@@ -99,32 +204,30 @@ class _Residuals:
         self.projector = at.projector
         self.n_channels = at.psi.shape[1]
 
-    def __iter__(self) -> Iterator[ComplexArray]:
-        """Yield the residuals of each group, shape (n_segments, n_freqs, n_channels)."""
+    def __iter__(self) -> Iterator[tuple[ComplexArray, ComplexArray]]:
+        """Yield residuals and motion of each group, (n_segments, n_freqs, n_channels) each."""
         for group in self._groups:
             shape = (len(self._spectra), len(group), self.n_channels)
-            residual = np.empty(shape, np.complex128)
+            residual, felt = np.empty((2, *shape), np.complex128)
             for place, number in enumerate(group.tolist()):
                 x = self._spectra[:, self._columns[number]].astype(np.complex128)
                 x *= np.sqrt(self._fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
                 motion = self._motion[number]
-                residual[:, place] = x - x @ motion.conj() @ motion.T
-            yield residual
+                felt[:, place] = x @ motion.conj() @ motion.T
+                residual[:, place] = x - felt[:, place]
+            yield residual, felt
 
     def powers(self, some: BoolArray) -> FloatArray:
         """Return mean powers of the residuals over some segments, shape (n_bins, n_channels)."""
-        return np.concatenate([np.mean(np.abs(each[some]) ** 2, axis=0) for each in self])
+        return np.concatenate([np.mean(np.abs(each[some]) ** 2, axis=0) for each, _ in self])
 
 
-def _disturbed(
-    residuals: Iterable[ComplexArray], degrees: FloatArray
-) -> tuple[BoolArray, BoolArray]:
+def _disturbed(power: FloatArray, degrees: FloatArray) -> tuple[BoolArray, BoolArray]:
     """Return whether each segment has outlying residuals, and which groups count.
 
-    Those whose powers scatter no more than by `RESTLESS`, of so many complex degrees of freedom.
-    No segment is disturbed if too many are.
+    Those whose powers, (n_segments, n_groups), scatter no more than by `RESTLESS`, of so many
+    complex degrees of freedom. No segment is disturbed if too many are.
     """
-    power = np.stack([(np.abs(each) ** 2).sum(axis=(1, 2)) for each in residuals], axis=1)
     middle = median(power)
     scatter = 1.4826 * median(np.abs(power - middle))
     calm = np.asarray(scatter < RESTLESS * middle / np.sqrt(degrees))

@@ -23,7 +23,12 @@ from estimator.checks.band_steadiness import (
     beside_weak_motion,
     is_weak_motion,
 )
-from estimator.checks.disturbed_segments import FREQUENCIES, SegmentCourse, disturbed_segments
+from estimator.checks.disturbed_segments import (
+    FREQUENCIES,
+    SegmentCourse,
+    SegmentFindings,
+    segment_findings,
+)
 from estimator.checks.steadied import Steadied, steadied
 from estimator.checks.steadiness import (
     FALSE_ALARM,
@@ -45,6 +50,8 @@ from estimator.types import BoolArray, FloatArray, IntArray
 
 MIN_SEGMENTS = 4
 """Minimum number of segments per part."""
+LEAST_LEFT = 0.02
+"""Share of the noise that gains add which change from segment to segment, to be named."""
 DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
 SECOND_ORDER = 4.0
@@ -314,8 +321,7 @@ def stability(
     by_run = [np.flatnonzero(runs == run) for run in sorted(set(runs.tolist()))]
     several = len(by_run) > 1 and all(averages[run].sum() > q + MIN_DEGREES for run in by_run)
     n_channels = maximum.psi.shape[1]
-    begin = np.array([parts.each[some[0]].begin for some in groups])
-    end = np.array([parts.each[some[-1]].end for some in groups])
+    begin, end = np.array([(parts.each[i[0]].begin, parts.each[i[-1]].end) for i in groups]).T
     correlation = np.concatenate([[1.0], neighbours, [0.0]])
     of_band = functools.partial(
         band_steadiness,
@@ -343,8 +349,7 @@ def stability(
     suspect = bool(explained.any())
     levels = [None if band is None else band.levels for band in bands]
     changes, added = _changed(bands, dims, begin, end, doubtful=doubtful and suspect)
-    low = np.array([frequency[inside][0] for inside in insides])
-    high = np.array([frequency[inside][-1] for inside in insides])
+    low, high = np.array([frequency[inside][[0, -1]] for inside in insides]).T
     if suspect and not doubtful:
         noise = [
             median(maximum.psi[inside & good]) if (inside & good).any() else np.zeros(n_channels)
@@ -359,6 +364,18 @@ def stability(
             dims=dims,
             time=(begin, end),
         )
+    single = SegmentFindings.none(0, dims)
+    if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
+        single = segment_findings(course, maximum, good, dims)
+    changes, added, left = _and_unstable(
+        (changes, added),
+        single,
+        maximum,
+        [inside & maximum.converged & ~maximum.singular for inside in insides],
+        edges=(low, high),
+        dims=dims,
+        time=(begin, end),
+    )
     without = None
     if changes or suspect:
         without = steadied(parts, maximum, psd, good=good, insides=insides)
@@ -369,9 +386,8 @@ def stability(
             levels = [None if band is None else band.levels for band in bands]
     elif not (changes or suspect) and all(each is None for each in levels):
         return None
-    out, excess, is_restless = np.zeros(0, np.bool_), np.zeros((1, n_channels)), False
-    if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
-        out, excess, is_restless = disturbed_segments(course, maximum, good)
+    within = np.full_like(explained, np.nan) if without is None else without.within
+    within[:, left.any(axis=0)] = np.nan  # parts do not show it
     return Stability(
         low=low,
         high=high,
@@ -384,13 +400,13 @@ def stability(
         inflations=np.array([1.0 if band is None else band.inflation for band in bands]),
         changes=changes,
         added=added,
-        explained=explained,
-        within=np.full_like(explained, np.nan) if without is None else without.within,
+        explained=np.maximum(explained, left),
+        within=within,
         n_segments=parts.n_segments,
-        disturbed=np.flatnonzero(out),
-        excess=float(excess.max()),
-        channel=int(excess.max(axis=0).argmax()),
-        is_restless=is_restless,
+        disturbed=np.flatnonzero(single.disturbed),
+        excess=float(single.excess.max()),
+        channel=int(single.excess.max(axis=0).argmax()),
+        is_restless=single.is_restless,
         steadied=() if without is None else (without,),
     )
 
@@ -402,6 +418,45 @@ def _tested(maximum: Maximum, bins: IntArray, n_effective: float) -> tuple[BoolA
     strong &= maximum.eigenvalues[:, maximum.n_factors - 1] > STRONG
     few, some = good[bins].sum() < FREQUENCIES, strong[bins].sum() >= FREQUENCIES
     return (strong, True) if few and some else (good, False)
+
+
+def _and_unstable(
+    known: tuple[tuple[ResponseChange, ...], FloatArray],
+    single: SegmentFindings,
+    maximum: Maximum,
+    insides: Sequence[BoolArray],
+    *,
+    edges: tuple[FloatArray, FloatArray],
+    dims: tuple[int, ...],
+    time: tuple[FloatArray, FloatArray],
+) -> tuple[tuple[ResponseChange, ...], FloatArray, FloatArray]:
+    """Return changes with those of gains that change from segment to segment, in their place.
+
+    With what changes add to the motion's PSD, as from `_changed`, and what such gains add to the
+    noise, as a share, shape (n_bands, n_channels).
+    """
+    changes, added = known
+    left = np.full((len(insides), sum(dims)), np.nan)
+    if not single.gains.any():
+        return changes, added, np.zeros_like(left)
+    variance = np.repeat(single.gains, dims)
+    for number, inside in enumerate(insides):
+        if inside.any():
+            at = maximum.take(np.flatnonzero(inside))
+            motion = (np.abs(at.eigenvectors) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
+            noise = np.where(variance, np.einsum("fpp->fp", at.rest).real, 1.0)
+            left[number] = variance * median(motion / noise)
+    left = np.where(np.isnan(left), np.nanmax(left, axis=0), left)
+    most = np.maximum.reduceat(left.max(axis=0), np.cumsum([0, *dims[:-1]]))
+    begin, end = float(time[0][0]), float(time[1][-1])
+    band = float(edges[0][0]), float(edges[1][-1])
+    for sensor in np.flatnonzero(most > LEAST_LEFT).tolist():
+        size, sure = math.sqrt(single.gains[sensor]), float(single.sure[sensor])
+        error = size / (2 * sure)
+        own = ResponseChange(sensor, None, False, size, error, begin, end, sure**2, 1.0, band)
+        changes = (own, *(each for each in changes if each.sensor != sensor))
+    left *= np.repeat(most > LEAST_LEFT, dims)
+    return changes, np.where(left.any(axis=0), np.maximum(added, variance), added), left
 
 
 def _also_by_band(

@@ -160,6 +160,11 @@ def _cycle(scene: Scene) -> FloatArray:
     return 1 + 0.01 * np.sin(2 * np.pi * scene.time / 300)
 
 
+def _jitter(scene: Scene) -> FloatArray:
+    steps = scene.rng.standard_normal(-(-N_SAMPLES // 400))
+    return np.asarray(1 + 0.02 * steps.repeat(400)[:N_SAMPLES])
+
+
 def _one_channel_step(scene: Scene) -> None:
     scene.felt[BROKEN, :, 0] *= _step(0.05)(scene)
 
@@ -518,6 +523,7 @@ KINDS: Mapping[str, Kind] = {
     ),
     "a resonance moves from 8 to 8.2 Hz": Kind(_filter_moves(_peak(8), _peak(8.2)), STEADY),
     "gain of an octave rises by 2 % at once": Kind(_octave_gains, STEADY),
+    "gain of a sensor jitters by 2 % in 4 s": Kind(_course(_jitter), STEADY),
 }
 PAIRS = (
     ("gain of a sensor rises by 3 %", "a channel has a square of 2e-3 of its rms"),
