@@ -463,7 +463,6 @@ def check_truth(
     *,
     gaps: bool = False,
     steady: bool = True,
-    latency: float = LATENCY,
 ) -> int:
     """See that rows, host times and rate of a session are those of the device.
 
@@ -473,8 +472,6 @@ def check_truth(
         Whether samples may, and must, be missing.
     steady
         Whether the device samples at its rate throughout.
-    latency
-        Seconds by which host time may be later than the last sample of a block.
 
     Returns
     -------
@@ -505,7 +502,7 @@ def check_truth(
     late = received - sent.due[last]
     assert late.min() >= -EARLY, f"{name}: received {-late.min():.3f} s before it was sampled"
     usual = np.quantile(late, 0.25)  # a busy computer delays some, a driver all
-    assert usual <= latency, f"{name}: received {usual:.3f} s after the last sample"
+    assert usual <= LATENCY, f"{name}: received {usual:.3f} s after the last sample"
     if len(late) >= 2 * MIN_HALF:  # the least of a half: others may have been held up
         halves = np.split(late, [len(late) // 2])
         drift = halves[1].min() - halves[0].min()

@@ -84,7 +84,6 @@ def wrong_gains(
     responses: Sequence[RelativeResponse],
     dims: tuple[int, ...],
     *,
-    tolerance: float = TOLERANCE,
     certified: Collection[int] = (),
 ) -> tuple[WrongGain, ...]:
     """Return the channels whose sensitivity the motion contradicts, in their order.
@@ -95,8 +94,6 @@ def wrong_gains(
         Of the pairs that can be compared.
     dims : tuple of int
         Channels of each sensor.
-    tolerance : float
-        Difference of a gain from 1 that is accepted.
     certified : collection of int
         Columns whose sensitivity is certain by a certificate.
 
@@ -116,8 +113,8 @@ def wrong_gains(
             for other in sensors
             if (one, other) in pairs
             and (other, one) in pairs
-            and not pairs[one, other].is_wrong(tolerance).any()
-            and not pairs[other, one].is_wrong(tolerance).any()
+            and not pairs[one, other].is_wrong().any()
+            and not pairs[other, one].is_wrong().any()
         }
         for one in sensors
     }
@@ -131,7 +128,7 @@ def wrong_gains(
             options = [_mean([pairs[other, sensor] for other in others])]
         else:
             options = [pairs[other, sensor] for other in others]
-        wrong = np.any([each.is_wrong(tolerance) for each in options], axis=0)
+        wrong = np.any([each.is_wrong() for each in options], axis=0)
         for place in np.flatnonzero(wrong).tolist():
             if starts[sensor] + place in certified:
                 continue
@@ -155,10 +152,10 @@ class _Gains:
     gains: FloatArray
     errors: FloatArray
 
-    def is_wrong(self, tolerance: float) -> FloatArray:
+    def is_wrong(self) -> FloatArray:
         """Return for each channel whether it is off by more than the tolerance and its error."""
         off = np.abs(self.gains - 1)
-        return np.asarray((off > tolerance) & (off > CERTAIN * self.errors))
+        return np.asarray((off > TOLERANCE) & (off > CERTAIN * self.errors))
 
 
 def _both_ways(response: RelativeResponse) -> list[tuple[tuple[int, int], _Gains]]:

@@ -244,7 +244,6 @@ def choose_dimension(
     dims: tuple[int, ...],
     n_effective: float,
     band: IntArray | None = None,
-    level: float = MISFIT_LEVEL,
     neighbours: FloatArray | None = None,
     maxima: Maxima | None = None,
 ) -> tuple[IntArray, tuple[BandDimension, ...]]:
@@ -262,8 +261,6 @@ def choose_dimension(
         Number of independent averages; must exceed the number of channels.
     band : int64, shape (n_freqs,), optional
         Index of the band of each frequency, non-decreasing; default: `bands`.
-    level : float
-        Level of the pooled model tests of all bands together.
     neighbours : float64, shape (n_lags,), optional
         From `estimator.likelihood.goodness_of_fit.neighbour_correlation`.
     maxima : Maxima, optional
@@ -327,7 +324,7 @@ def choose_dimension(
     )
     r = goodness_of_fit.HANN_HALF if neighbours is None else neighbours
     open_bands = list(stride)
-    level /= len(open_bands)
+    level = MISFIT_LEVEL / len(open_bands)
     tried: dict[int, list[goodness_of_fit.BandTest]] = {b: [] for b in open_bands}
     cov: dict[tuple[int, int], float] = {}
     for q in range(most + 1):

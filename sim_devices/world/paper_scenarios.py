@@ -35,7 +35,7 @@ def _white_motion(along_x: float, ratio: float = 1.5) -> CommonMotion:
 
 
 def three_channels(
-    *, turned: tuple[float, float, float], snr: float, ratio: float = 1.5, seed: int = 0
+    *, turned: tuple[float, float, float], snr: float, ratio: float = 1.5
 ) -> Scenario:
     """Return Fig. 3: uniaxial sensors i, j, k in a plane, each rotated from x by an angle.
 
@@ -51,7 +51,6 @@ def three_channels(
     cosine, sine = np.cos(np.radians(turned[0])), np.sin(np.radians(turned[0]))
     along_x = snr * NOISE / float(cosine**2 + ratio * sine**2)
     return Scenario(
-        seed=seed,
         motion=_white_motion(along_x, ratio),
         sensors={
             name: SensorModel(
@@ -65,16 +64,13 @@ def three_channels(
     )
 
 
-def biaxial(
-    *, theta: float, channel_angles: tuple[float, float, float], snr: float, seed: int = 0
-) -> Scenario:
+def biaxial(*, theta: float, channel_angles: tuple[float, float, float], snr: float) -> Scenario:
     """Return Figs. 8 and 11: biaxial sensors, j and k rotated by `theta` (degrees).
 
     `channel_angles` are the angles between the channels of each sensor in degrees. Channel 1 of
     sensor i points along x; `snr` is that of this channel.
     """
     return Scenario(
-        seed=seed,
         motion=_white_motion(snr * NOISE),
         sensors={
             name: SensorModel(
@@ -152,7 +148,7 @@ LABORATORY: Spectrum = Sum(
 """Motion of a laboratory floor: below the noise at 2 Hz, with structural modes above."""
 
 
-def laboratory(turned: Mapping[str, float], *, speed: float = 600.0, seed: int = 0) -> Scenario:
+def laboratory(turned: Mapping[str, float], *, seed: int = 0) -> Scenario:
     """Return five triaxial servo-accelerometers on a floor with waves of finite speed.
 
     At 600 m/s waves do little to equilateral triangles and much to wider ones, as in Figs. 10
@@ -160,7 +156,7 @@ def laboratory(turned: Mapping[str, float], *, speed: float = 600.0, seed: int =
     """
     return Scenario(
         seed=seed,
-        motion=PlaneWaves(spectrum=LABORATORY, speed=speed),
+        motion=PlaneWaves(spectrum=LABORATORY, speed=600.0),
         sensors={
             name: SensorModel(
                 sampling_rate=SAMPLING_RATE,

@@ -321,13 +321,8 @@ class Ledger:
         key = "issued", entry.number, entry.revision
         return any(key == (r["kind"], r["number"], r["revision"]) for r, _ in self._records())
 
-    def signed_rows(self, wanted: str = "") -> dict[str, int]:
+    def signed_rows(self) -> dict[str, int]:
         """Return how many rows each key has signed, by its id.
-
-        Parameters
-        ----------
-        wanted : str
-            Id of a key: only its signatures count.
 
         Raises
         ------
@@ -352,8 +347,7 @@ class Ledger:
                 raise LedgerError(
                     f"{self._path}: changed by hand: row {row} is not the one that was signed"
                 )
-            if wanted in {"", key_id(key)}:
-                found[key_id(key)] = max(row, found.get(key_id(key), 0))
+            found[key_id(key)] = max(row, found.get(key_id(key), 0))
         return found
 
     def _clear_up(self) -> None:

@@ -63,7 +63,7 @@ def legend(budgets: Iterable[Budget]) -> str:
     )
 
 
-def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
+def with_error(value: float, expanded: float) -> str:
     """Return a number with its expanded uncertainty, both to the same place."""
     if not math.isfinite(value):
         return "?"
@@ -71,9 +71,9 @@ def with_error(value: float, expanded: float, *, digits: int = 2) -> str:
         return f"{signed(value, '.6g')} ± ?"
     if expanded <= 0:
         return signed(value, ".6g")
-    place = max(0, digits - 1 - math.floor(math.log10(expanded)))
-    step = 10.0 ** (digits - 1 - math.floor(math.log10(expanded)))
-    if place == 0:  # integers, rounded to the digits that mean something
+    place = 1 - math.floor(math.log10(expanded))  # of the second digit
+    if place <= 0:  # integers, rounded to the digits that mean something
+        step, place = 10.0**place, 0
         value, expanded = round(value * step) / step, math.ceil(expanded * step) / step
     return f"{signed(value, f'.{place}f')} ± {expanded:.{place}f}"
 

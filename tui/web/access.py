@@ -223,7 +223,7 @@ class Ended:
         OSError
             If that cannot be written: it is ended until the next start only.
         """
-        now = self._now()
+        now = time.time()
         self._ends = {each: end for each, end in self._ends.items() if end >= now}
         self._ends[number] = ends
         lines = (json.dumps(each) for each in self._ends.items())
@@ -245,7 +245,7 @@ class _Attempts:
         TooManyAttemptsError
             If there were too many; this one must not be looked at.
         """
-        now, found = self._now(), {}
+        now, found = time.time(), {}
         for key, most in limits.items():
             found[key] = [each for each in self._times.get(key, ()) if now - each < WITHIN]
             if len(found[key]) >= most:
@@ -287,8 +287,6 @@ class Access:
         Known to the server alone.
     ended : Ended
         Visits that are over.
-    now : callable
-        UTC in s since 1970.
 
     Raises
     ------
@@ -296,22 +294,15 @@ class Access:
         If a variable of the environment has no token.
     """
 
-    def __init__(
-        self,
-        web: Web,
-        key: bytes,
-        ended: Ended,
-        *,
-        now: Callable[[], float] = time.time,
-    ) -> None:
+    def __init__(self, web: Web, key: bytes, ended: Ended) -> None:
         found = {Right.STEER: web.steer, Right.READ: web.read}
         self._secrets = {
             right: secret
             for right, line in found.items()
             if (secret := _resolved(line)) is not None
         }
-        self._key, self._ended, self._now = key, ended, now
-        self._attempts = _Attempts(now)
+        self._key, self._ended = key, ended
+        self._attempts = _Attempts(time.time)
 
     @property
     def is_open(self) -> bool:
@@ -342,7 +333,7 @@ class Access:
             "number": secrets.token_hex(16),
             "name": name,
             "right": right,
-            "ends": self._now() + LASTS,
+            "ends": time.time() + LASTS,
         }
         about = base64.urlsafe_b64encode(json.dumps(told).encode()).decode()
         return f"{about}.{self._mac(right, about)}"
@@ -358,7 +349,7 @@ class Access:
             return None
         if right not in self._secrets or not same(mac, self._mac(right, about)):
             return None
-        if ends < self._now() or number in self._ended:
+        if ends < time.time() or number in self._ended:
             return None
         return Visitor(name, right, self._mac(right, "form", cookie), number, ends)
 
