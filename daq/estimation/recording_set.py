@@ -148,17 +148,17 @@ def check_span(passes: Sequence[Pass], settings: Settings) -> None:
         for name, instant in (("start", settings.start), ("end", settings.end))
         if instant is not None
     ]
-    covered = [_covered(each) for each in passes if each.aligned.clocks]
-    if wanted and covered and not any(each.n_complete for each in passes):
+    begun = [each for each in passes if each.aligned.clocks]
+    if wanted and begun and not any(each.n_complete for each in passes):
         raise WrongSettingError(
-            f"{', '.join(wanted)}: not one segment of {settings.segment:g} s lies there: "
-            + "; ".join(covered)
+            f"{', '.join(wanted)}: not one segment of {settings.segment:g} s lies there:"
+            f" {_covered(begun)}"
         )
     for number, text in enumerate(settings.exclude):
         spans = [(each.excluded()[number], each.aligned.n_available) for each in passes]
-        if covered and all(after <= 0 or first >= n for (first, after), n in spans):
+        if begun and all(after <= 0 or first >= n for (first, after), n in spans):
             begin, end = (_utc(datetime.fromisoformat(at).timestamp()) for at in text.split("/"))
-            raise WrongSettingError(f"exclude {begin}/{end}: nothing there: {'; '.join(covered)}")
+            raise WrongSettingError(f"exclude {begin}/{end}: nothing there: {_covered(begun)}")
 
 
 def _twice(path: Path, other: ReadableRecording) -> WrongSettingError:
@@ -168,13 +168,17 @@ def _twice(path: Path, other: ReadableRecording) -> WrongSettingError:
     )
 
 
-def _covered(each: Pass) -> str:
-    whole = AlignedRecording(each.recording, nominal_clocks=True)
-    start, seconds = whole.start_utc_ns * 1e-9, whole.n_available / whole.sampling_rate
-    return (
-        f"{each.recording.path} covers {_utc(start)} to {_utc(start + seconds)} UTC"
-        f" ({format_duration(round(seconds, 1))})"
-    )
+def _covered(passes: Sequence[Pass]) -> str:
+    """Return what the recordings cover, for a message: their arrival times are read once more."""
+    found = []
+    for each in passes:
+        whole = AlignedRecording(each.recording, nominal_clocks=True)
+        start, seconds = whole.start_utc_ns * 1e-9, whole.n_available / whole.sampling_rate
+        found.append(
+            f"{each.recording.path} covers {_utc(start)} to {_utc(start + seconds)} UTC"
+            f" ({format_duration(round(seconds, 1))})"
+        )
+    return "; ".join(found)
 
 
 def _utc(seconds: float) -> str:

@@ -7,13 +7,16 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from daq.bench.estimate_settings import from_text
+from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import WrongSettingError
+from daq.estimation import recording_set
 from daq.estimation.estimation import estimate
 from daq.estimation.segments import clipping
 from daq.estimation.settings import Settings
@@ -134,6 +137,20 @@ def test_instants_and_times_after_the_start_are_alike(tmp_path: Path) -> None:
     facts = Result(found[0], Settings(segment=4.0, exclude=(EXCLUDED,))).facts
     (fact,) = (each for each in facts if isinstance(each, SegmentsExcluded))
     assert fact.words.explanation == "8 segments excluded by choice of the time (--exclude)."
+
+
+def test_arrival_times_are_read_once_more_for_a_refusal_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = recording(tmp_path / "r.h5", 0)
+    read = Mock(side_effect=AlignedRecording)
+    monkeypatch.setattr(recording_set, "AlignedRecording", read)
+    some = replace(Settings(segment=4.0), start=START + timedelta(seconds=20))
+    assert estimate([path], replace(some, exclude=(EXCLUDED,))).n_segments > 0
+    assert not read.called
+    with pytest.raises(WrongSettingError, match=r"lies there: .*r\.h5 covers .* UTC \(2m\)"):
+        estimate([path], replace(some, start=START + timedelta(hours=1)))
+    assert read.call_count == 1
 
 
 def test_an_exclusion_of_nothing_is_refused(tmp_path: Path) -> None:
