@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.studies.responses import CASES, QUANTITIES, calibration
+from benchmarks.studies.responses import QUANTITIES, calibration
 
 
 def test_uncertainties_of_calibrations_cover_the_truth() -> None:
@@ -11,8 +11,3 @@ def test_uncertainties_of_calibrations_cover_the_truth() -> None:
     assert [series.label for _, series in study.series()] == list(QUANTITIES)
     assert study.agrees
     assert shares == sorted(shares)
-
-
-def test_cases_differ_in_one_sensor() -> None:
-    assert len(CASES) == 4
-    assert all(usual != other for _, _, usual, other, _ in CASES)
