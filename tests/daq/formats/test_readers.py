@@ -216,14 +216,6 @@ def test_delimited_header_names_sensors_channels_and_units(tmp_path: Path) -> No
     np.testing.assert_array_equal(a.stretches[0].counts, [[1, -2], [4, 5], [7, 8]])
 
 
-def test_delimited_times_since_1970_keep_their_last_decimal(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("time,X\n1700000000.123456789,1\n1700000001.123456789,2\n")
-    (sensor,) = read_delimited(path)
-    assert sensor.name == "a"
-    assert sensor.stretches[0].start_utc_ns == 1_700_000_000_123_456_789
-
-
 def test_delimited_missing_rows_make_gaps_and_missing_cells_none(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = [f"2026-11-21T03:00:{s:02d}Z,{s},{'' if s == 4 else s}" for s in range(10) if s != 7]
@@ -233,16 +225,6 @@ def test_delimited_missing_rows_make_gaps_and_missing_cells_none(tmp_path: Path)
     assert sensor.first_samples() == [0, 8]
     assert [s.n_samples for s in sensor.stretches] == [7, 2]
     assert np.argwhere(np.isnan(sensor.stretches[0].counts[:])).tolist() == [[4, 1]]
-
-
-def test_delimited_a_clock_that_is_off_keeps_its_rate(tmp_path: Path) -> None:
-    rate = 100.0 * (1 + 50e-6)
-    path = tmp_path / "a.csv"
-    rows = [f"{k / rate:.9f},{k}" for k in range(20_000)]
-    path.write_text("time,X\n" + "\n".join(rows) + "\n")
-    (sensor,) = read_delimited(path)
-    assert sensor.sampling_rate == pytest.approx(rate, rel=1e-9)
-    assert len(sensor.stretches) == 1
 
 
 def test_delimited_without_time_the_rate_must_be_given(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import welch
 
 from daq.errors import ImportFormatError
 from daq.formats.importer import import_files
@@ -125,31 +124,6 @@ def test_data_without_a_date_take_the_only_epoch(tmp_path: Path) -> None:
     import_files([tmp_path / "a.npz"], tmp_path / "a.h5", response_for=[("s", only)])
     with Recording.open(tmp_path / "a.h5") as recording:
         assert recording.sensors[0].channels[0].sensitivity == pytest.approx(2000, rel=1e-5)
-
-
-def test_obspy_removes_the_same_response(tmp_path: Path) -> None:
-    """Motion by our response is the motion that ObsPy returns, in every band."""
-    path = station_file(tmp_path / "s.xml", EPOCHS)
-    source = waveform(tmp_path / "a.mseed", "2026-01-10")
-    trace = obspy.read(str(source), format="MSEED")[0]
-    counts = trace.data.astype(float)
-    response = taken(path)
-    n = 2 * len(counts)
-    frequency = np.fft.rfftfreq(n, 1 / RATE)[1:]
-    spectrum = np.fft.rfft(counts, n)
-    spectrum[0] = 0
-    spectrum[1:] /= response.sensitivity * response.shape.at(frequency.astype(np.float64))
-    ours = np.fft.irfft(spectrum, n)[: len(counts)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        inventory = obspy.read_inventory(str(path), format="STATIONXML")
-        trace.remove_response(
-            inventory, output="VEL", water_level=None, zero_mean=False, taper=False
-        )
-    band, theirs = welch(trace.data, RATE, nperseg=500)
-    _, found = welch(ours, RATE, nperseg=500)
-    # The spectra have one window, so that what it leaks is in both.
-    assert np.abs(10 * np.log10(found / theirs))[band > 0].max() < 1e-4
 
 
 def test_a_gain_holds_at_its_own_frequency(tmp_path: Path) -> None:

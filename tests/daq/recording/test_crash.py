@@ -195,21 +195,6 @@ def test_a_first_block_of_one_sample_is_verified(tmp_path: Path) -> None:
     assert found.bad_blocks == (0,)
 
 
-def test_damage_is_found_and_reported(tmp_path: Path) -> None:
-    path = tmp_path / "r.h5"
-    make(path)
-    with h5py.File(path, "r") as file:
-        chunk = file["sensors/a/samples"].id.get_chunk_info(1)
-    with path.open("r+b") as raw:
-        raw.seek(chunk.byte_offset + 20)
-        raw.write(b"\xff" * 4)
-    report = verify(path)
-    # Rows 100 to 199 are in that chunk, four blocks of 25.
-    assert report.sensors[0].bad_blocks == (4, 5, 6, 7)
-    with Recording.open(path) as recording, pytest.raises(RecordingError, match="is damaged"):
-        recording.sensors[0].counts()
-
-
 def test_a_wrong_block_row_is_found(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     make(path)
