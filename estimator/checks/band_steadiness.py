@@ -30,7 +30,7 @@ from estimator.checks.steadiness import (
 )
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum, maximise
-from estimator.likelihood.goodness_of_fit import critical_value
+from estimator.likelihood.goodness_of_fit import critical_value, upper_tail
 from estimator.median import median
 from estimator.records import dataclass
 from estimator.spectra.parts import Parts
@@ -109,7 +109,7 @@ class _Explained:
     def where_clear(self, alarm: float) -> FloatArray:
         """Return what is added to the noise, shape (n_channels,); zero where that is by chance."""
         statistic, degrees = self.clearest
-        is_clear = degrees > 0 and statistic > critical_value(degrees, alarm)
+        is_clear = degrees > 0 and upper_tail(degrees, statistic) < alarm
         return np.nan_to_num(self.added) if is_clear else np.zeros_like(self.added)
 
 

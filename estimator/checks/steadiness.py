@@ -42,6 +42,8 @@ SHARES = (0.0, 0.25, 0.5, 0.75)
 """Of a part, after which a step is looked for."""
 RAMP = 4
 """Parts of a ramp, at least."""
+ALIKE = 1e-6
+"""Difference of chi-squared by rounding."""
 COST = 4.0
 """Of each parameter of a change, in terms of chi-squared: simple changes are named."""
 FALSE_ALARM = 2e-3
@@ -61,6 +63,8 @@ class Regression:
         steady.
     coefficients : complex128, shape (n_parts, n_bins, n_channels, n_factors)
         ``D_k``.
+    along : complex128, of the same shape
+        ``n_k P S_k U``: coefficients times motion.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
         ``n_k U* S_k U``.
     directions : complex128, shape (n_bins, n_channels, n_factors)
@@ -78,6 +82,7 @@ class Regression:
 
     left: ComplexArray
     coefficients: ComplexArray
+    along: ComplexArray
     motion: ComplexArray
     directions: ComplexArray
     projector: ComplexArray
@@ -93,11 +98,11 @@ class Regression:
         Summed over frequencies, shape (n_parts, n_channels), times the averages of each part:
         scatter alone explains one of the covariance for each direction of the motion.
         """
-        D, W = self.coefficients[some], self.motion[some]
-        both = (D @ W).sum(axis=0).swapaxes(1, 2), W.sum(axis=0).swapaxes(1, 2)
-        D = D - np.linalg.solve(both[1], both[0]).swapaxes(1, 2)
+        D, DW, W = self.coefficients[some], self.along[some], self.motion[some]
+        both = DW.sum(axis=0).swapaxes(1, 2), W.sum(axis=0).swapaxes(1, 2)
+        mean = np.linalg.solve(both[1], both[0]).swapaxes(1, 2)
         found = np.zeros((len(some), D.shape[2]))
-        found[some] = ((D @ W) * D.conj()).sum(axis=(1, 3)).real
+        found[some] = ((DW - mean @ W) * (D - mean).conj()).sum(axis=(1, 3)).real
         return found
 
 
@@ -112,14 +117,16 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     share = (np.abs(U) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
     fitted = np.einsum("fpp->fp", at.rest).real + share
     scale = np.sqrt(fitted / psd)
-    S = parts.csm * scale[:, :, None] * scale[:, None, :]
+    S = parts.csm * (scale[:, :, None] * scale[:, None, :])
     SU = S @ U
     across = U.conj().swapaxes(1, 2) @ SU
     across = (across + across.conj().swapaxes(2, 3)) / 2
     beside = at.projector
-    PSU = beside @ SU
+    PSU = SU - U @ across
     D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
-    left = beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)
+    # P S P - D (P S U)*, of which P is 1 - U U*
+    taken = np.concatenate([np.broadcast_to(U, SU.shape), PSU, D], axis=3)
+    left = S - taken @ np.concatenate([SU, taken[..., : 2 * q]], axis=3).conj().swapaxes(2, 3)
     covariance = left.real * (n / (n - q))[:, None, None, None]
     inverse = fisher.covariance(np.abs(beside) ** 2)
     excess = np.einsum("kfpp->kfp", covariance) - np.einsum("fpp->fp", beside).real
@@ -129,6 +136,7 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
         inverse=inverse,
         noise=(inverse @ excess[..., None])[..., 0],
         coefficients=D,
+        along=n[:, None, None, None] * PSU,
         motion=n[:, None, None, None] * across,
         directions=U,
         projector=beside,
@@ -216,29 +224,26 @@ class ResponseScores:
         a, b = self._to, self._from
         U, P, s = found.directions, found.projector, found.scale
         ratio = s[:, a] / s[:, b]
-        DWU = found.coefficients @ found.motion @ U.conj().swapaxes(1, 2)
-        score = (ratio * DWU[:, :, a, b].real).sum(axis=1)
-        M = U @ found.motion @ U.conj().swapaxes(1, 2)
-        PP = P[:, a[:, None], a] * (ratio[:, :, None] * ratio[:, None, :])
+        score = found.along @ U.conj().swapaxes(1, 2)
         # variance of the score, with neighbours correlated, over the independent one
         more = float(correlation.sum() / len(correlation))
         UU = U @ U.conj().swapaxes(1, 2)
         by_noise = ratio[:, :, None] * (P[:, a] * UU[:, :, b].swapaxes(1, 2)).real
         self._by_noise += 2 / more * by_noise.sum(axis=0)
         self._averages = found.averages + U.shape[2]
-        explained = (
-            ((found.coefficients @ found.motion) * found.coefficients.conj()).sum(axis=3).real
-        )
+        explained = (found.along * found.coefficients.conj()).sum(axis=3).real
         beside = np.einsum("kfpp->kfp", found.left).real - np.einsum("fpp->fp", P).real
         excess = beside + explained / self._averages[:, None, None]
         self._noise += (found.inverse @ excess[..., None])[..., 0].sum(axis=1)
         self._n_bins += len(U)
-        for k in range(len(self.score)):
-            turned = M[k][:, b, :][:, :, b].swapaxes(1, 2)  # [f, (a,b), (c,e)] = M[e, b]
-            information = np.einsum("fij,fij->ij", PP, turned).real
-            weight = 2 / more
-            self.score[k] += weight * score[k]
-            self.information[k] += weight * information
+        self.score += 2 / more * (ratio * score[:, :, a, b].real).sum(axis=1)
+        beside, along = P * (s[:, :, None] * s[:, None, :]), U / s[:, :, None]
+        motion = along @ found.motion @ along.conj().swapaxes(1, 2)
+        edges = np.cumsum([0, *self.dims])
+        own = [slice(*each) for each in itertools.pairwise(edges)]
+        for (i, one), (j, other) in itertools.product(enumerate(own), repeat=2):
+            information = _products(beside[:, one, other], motion[:, :, other, one])
+            self.information[:, self.of_sensor[i], self.of_sensor[j]] += 2 / more * information
 
     def sensor(self, sensor: int) -> tuple[FloatArray, FloatArray]:
         """Return score (n_parts, d*d) and information (n_parts, d*d, d*d) of a sensor."""
@@ -296,6 +301,20 @@ class ResponseScores:
     def test(self, sensor: int, known: Sequence[int] = ()) -> tuple[float, float]:
         """Return chi-squared and degrees of a sensor, beside those known to change."""
         return _chi_squared(*self.without(known).sensor(sensor))
+
+
+def _products(beside: ComplexArray, motion: ComplexArray) -> FloatArray:
+    """Return real parts of ``beside[f, a, c] motion[k, f, e, b]``, summed over f.
+
+    As [k, (a, b), (c, e)]: by a matrix product of the real and imaginary parts of all frequencies.
+    """
+    n_parts, n_bins, e, b = motion.shape
+    _, a, c = beside.shape
+    left = np.concatenate([beside.real, -beside.imag]).reshape(2 * n_bins, a * c)
+    right = np.concatenate([motion.real, motion.imag], axis=1).swapaxes(0, 1)
+    found = left.T @ right.reshape(2 * n_bins, -1)
+    found = found.reshape(a, c, n_parts, e, b).transpose(2, 0, 4, 1, 3)
+    return np.asarray(found.reshape(n_parts, a * b, c * e))
 
 
 def _chi_squared(score: FloatArray, information: FloatArray) -> tuple[float, float]:
@@ -383,8 +402,8 @@ class _Course:
 def _courses(begin: FloatArray, end: FloatArray) -> list[_Course]:
     """Return steps, also within parts, and ramps over several parts."""
     n, place, found = len(begin), np.arange(len(begin)), []
-    for at in range(n):
-        for share in SHARES if at else SHARES[1:]:  # of the part before the step
+    for at in range(1, n):  # within the first part, any step is one at its end, and larger
+        for share in SHARES:  # of the part before the step
             height = (place > at) + (1 - share) * (place == at)
             time = float(begin[at] + share * (end[at] - begin[at]))
             found.append(_Course(time, time, height))
@@ -418,7 +437,7 @@ def response_change(
             found = variance @ (rows @ along)
             gained = float(found @ (rows @ along)) - COST * len(rows)
             gained -= COST if each.begin < each.end else 0.0
-            if gained > best:
+            if gained > best + ALIKE:
                 best, pattern, course = gained, one, each
                 size = float(np.linalg.norm(found)) if one[1] else float(found[0])
                 error = math.sqrt(float(np.trace(variance)) / len(rows))
