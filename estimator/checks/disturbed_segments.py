@@ -102,13 +102,18 @@ def segment_findings(
     known = np.flatnonzero(course.bins < len(good))
     known = known[(maximum.converged & ~maximum.singular)[course.bins[known]]]
     is_good = good[course.bins[known]]
-    there = np.concatenate([known[is_good], known[~is_good]])
-    counts = int(is_good.sum()) // FREQUENCIES, int((~is_good).sum()) // FREQUENCIES
-    if not any(counts):
+    # of frequencies that are not good, noise may seem to be zero
+    both = [e if len(e) >= FREQUENCIES else e[:0] for e in (known[is_good], known[~is_good])]
+    there, n_good = np.concatenate(both), len(both[0]) // FREQUENCIES
+    if not len(there):
         return none
     at = maximum.take(course.bins[there])
-    both = np.split(np.arange(len(there)), [int(is_good.sum())])
-    groups = [e for some, n in zip(both, counts, strict=True) if n for e in np.array_split(some, n)]
+    groups = [
+        group
+        for some in np.split(np.arange(len(there)), [len(both[0])])
+        if len(some)
+        for group in np.array_split(some, len(some) // FREQUENCIES)
+    ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
     gains, power = _Gains(own, groups, dims), []
@@ -117,11 +122,11 @@ def segment_findings(
         gains.add(residual, motion)
     variance, sure = gains.variance()
     found = replace(none, gains=variance, sure=sure)
-    groups = groups[: counts[0]]  # of others, noise may seem to be zero
+    groups = groups[:n_good]
     if not groups:
         return found
     degrees = np.array([own[group].sum() for group in groups])
-    out, calm = _disturbed(np.stack(power[: counts[0]], axis=1), degrees)
+    out, calm = _disturbed(np.stack(power[:n_good], axis=1), degrees)
     found = replace(found, is_restless=not calm.all())
     if not out.any() or variance.any():
         return found

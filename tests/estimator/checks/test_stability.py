@@ -9,7 +9,7 @@ import pytest
 
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.disturbed_segments import SegmentCourse
+from estimator.checks.disturbed_segments import SegmentCourse, segment_findings
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
     may_have_moved,
@@ -19,6 +19,7 @@ from estimator.checks.shared_motion import (
 from estimator.checks.stability import Scatter, Stability
 from estimator.checks.steadied import Steadied
 from estimator.checks.steadiness import ResponseChange
+from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
 from estimator.spectra.welch import (
@@ -124,6 +125,20 @@ def test_disturbed_segments_are_named() -> None:
     assert advice.n_segments == N_SEGMENTS
     # 100 samples of variance 1600 among 38 528 of variance 1, by the window's square over its mean
     assert 2 < advice.excess < 9
+
+
+def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> None:
+    rng = np.random.default_rng(1)
+    noise, motion = rng.standard_normal((2, 200, 48, 3, 2)) @ [1, 1j]
+    noise[7, :, 1] *= 30
+    spectra = noise + 30 * motion[:, :, :1]
+    csm = np.einsum("sfp,sfq->fpq", spectra, spectra.conj()) / len(spectra)
+    course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
+    for n_doubtful, found in ((0, [7]), (4, [7]), (20, [7]), (44, [])):
+        good = np.arange(48) >= n_doubtful
+        shown = segment_findings(course, maximise(csm, 1), good, (1, 1, 1))
+        assert np.flatnonzero(shown.disturbed).tolist() == found
+        assert not shown.gains.any()
 
 
 def test_changing_noise_causes_no_false_alarms() -> None:
