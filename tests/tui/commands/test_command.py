@@ -412,12 +412,6 @@ def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
     assert not result.stdout
 
 
-def test_a_window_that_nobody_knows_is_exit_2(tmp_path: Path) -> None:
-    file = str(imported(tmp_path))
-    result = huddle("estimate", file, "--window", "hat", code=2)
-    assert "--window 'hat'" in result.stderr
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="locales")
 def test_output_survives_a_terminal_that_knows_no_signs(tmp_path: Path) -> None:
     file = str(imported(tmp_path))

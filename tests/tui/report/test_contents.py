@@ -178,15 +178,6 @@ def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
     assert "segments excluded where a sensor has a gap" in " ".join(texts_of(reported.report))
 
 
-def test_alignment_clocks_and_model_test_are_there(reported: Reported) -> None:
-    text = Words(reported.page).text
-    assert "Alignment of the sensors" in text
-    assert "Model test" in text
-    assert "The recording against time" in text
-    (clocks,) = tables(reported.report, "Clocks")
-    assert [row[0] for row in clocks.rows] == ["A", "B", "C", HOSTILE]
-
-
 def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
     recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
     record(recording, before_end=lambda: shutil.copyfile(recording, copy))
