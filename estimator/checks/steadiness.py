@@ -122,11 +122,9 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     across = U.conj().swapaxes(1, 2) @ SU
     across = (across + across.conj().swapaxes(2, 3)) / 2
     beside = at.projector
-    PSU = SU - U @ across
+    PSU = beside @ SU  # beside has more digits than 1 - U U*, where a channel is nearly motion
     D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
-    # P S P - D (P S U)*, of which P is 1 - U U*
-    taken = np.concatenate([np.broadcast_to(U, SU.shape), PSU, D], axis=3)
-    left = S - taken @ np.concatenate([SU, taken[..., : 2 * q]], axis=3).conj().swapaxes(2, 3)
+    left = beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)
     covariance = left.real * (n / (n - q))[:, None, None, None]
     inverse = fisher.covariance(np.abs(beside) ** 2)
     excess = np.einsum("kfpp->kfp", covariance) - np.einsum("fpp->fp", beside).real
