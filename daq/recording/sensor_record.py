@@ -205,17 +205,18 @@ class LocatedChunks:
         self._file, self._length = dataset.file.id, dataset.chunks[0]
         row_bytes = dataset.dtype.itemsize * int(np.prod(dataset.chunks[1:]))
         self._n_bytes = self._length * row_bytes
-        self._stored = np.full((-(-len(dataset) // self._length), 3), -1, np.int64)
+        self._at, self._size, self._mask = np.full((3, -(-len(dataset) // self._length)), -1)
         """Byte of the file at which each chunk begins, its bytes and its mask; -1 if unknown."""
         file = dataset.file
         if file.driver == "sec2" and not file.userblock_size and hasattr(os, "preadv"):
             dataset.id.chunk_iter(self._note)
-        at, size, mask = self._stored.T
-        self._raw_at = np.where((mask == RAW) & (size == self._n_bytes), at, -1)
+        is_raw = (self._mask == RAW) & (self._size == self._n_bytes)
+        self._raw_at = np.where(is_raw, self._at, -1)
 
     def _note(self, chunk: Any) -> None:  # noqa: ANN401 - h5py names no type
-        number = chunk.chunk_offset[0] // self._length
-        self._stored[number] = chunk.byte_offset, chunk.size, chunk.filter_mask
+        at = chunk.chunk_offset[0] // self._length
+        self._at[at], self._size[at] = chunk.byte_offset, chunk.size
+        self._mask[at] = chunk.filter_mask
 
     def stored(self, first: int, n_chunks: int) -> list[tuple[int, Buffer]] | None:
         """Return mask and bytes of chunks, from chunk `first` on; None if not all are known.
@@ -225,7 +226,8 @@ class LocatedChunks:
         OSError
             If the file cannot be read.
         """
-        at, size, mask = self._stored[first : first + n_chunks].T
+        some = slice(first, first + n_chunks)
+        at, size, mask = self._at[some], self._size[some], self._mask[some]
         if len(at) < n_chunks or (at < 0).any() or (size > 2 * self._n_bytes).any():
             return None
         handle, begin, end = self._file.get_vfd_handle(), int(at.min()), int((at + size).max())
