@@ -13,6 +13,7 @@ from estimator.levels.interval import unpredicted
 from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import EQUATIONS, most_pooled, pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
+from estimator.median import median
 from estimator.self_noise.coherency import check_averages, coherency
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_channel import three_channel
@@ -196,7 +197,7 @@ def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: floa
     def mean(each: FloatArray) -> FloatArray:
         return np.asarray((np.add.reduceat(each, first) / count[:, None])[block])
 
-    course = (rest / mean(rest)).mean(axis=1)
+    course = median((rest / mean(rest)).T)
     half = int(SMOOTH / n_effective / 2)
     begin = np.maximum(np.arange(len(psd)) - half, first[block])
     end = np.minimum(np.arange(len(psd)) + half + 1, (first + count)[block])

@@ -6,10 +6,10 @@ neighbouring bins, and its scatter would contain the cost. Project, then pool:
 1. A *block* of bins (a third of an octave, `LEAST_BINS` at least) is cut into *sub-blocks* of k
    neighbours that are worth `ENOUGH` averages.
 2. r of the q dimensions of the motion are *resolved*: their eigenvalues in the median sub-block
-   stand out, whichever sensor is left out, and apart from the next ones. Their directions are taken
-   from each sub-block, so that a response may vary over the block however strong the motion is.
-   Where one does not stand out, or a line of one sensor does like motion, it is taken from the
-   nearest other sub-block.
+   stand out, whichever sensor is left out, and apart from the next ones. Each sub-block has the
+   directions that stand out in it, so that a response may vary over the block however strong the
+   motion is; beside a line of one sensor, those that the others show. Where one of r does not
+   stand out, it is that of the nearest other sub-block.
 3. Directions of the others are those of the mean of the projected sub-blocks, one set for the
    block. A response that varies leaks little there: SNR times the square of its variation. The
    set has up to q, since resolved directions may turn from one sub-block to the next; each takes
@@ -81,6 +81,9 @@ SHOWN = 2.0
 HIDES = 0.5
 """Least share of a direction of a sensor's noise that a sub-block keeps, over the usual one of its
 block, below which a line of that sensor stands out there like motion."""
+FELT = 0.5
+"""Power of the least dimension in the other sensors, over what these show, below which it is less
+than that of their motion."""
 UNSEEN = 0.67
 """Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
 much that the interval holds the noise however much of this motion there is."""
@@ -293,9 +296,16 @@ def _pool(
     enough = np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p) * fewer) + 1
     k = np.minimum(enough, sizes)
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
-    # what the largest sub-blocks do not resolve, smaller ones do not either
+    # what the largest sub-blocks do not resolve, smaller ones do not either, but for a few
+    parts, mean = cut(at, k)
+    X = white(mean, whitener[parts.block], sensor)
+    axis = _axes(X, 1)
+    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[parts.block] / parts.averages)) ** 2
+    stands = np.einsum("bpi,bpq,bqi->b", axis.conj(), X, axis).real > edge
+    best[np.logical_or.reduceat(stands, parts.first)] = -1
     parts, mean = cut(at, largest)
-    at = at[_n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor) > 0]
+    r = _n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor)
+    at = at[(q > 0) & ((r > 0) | (best < 0))]
     while len(at):
         parts, mean = cut(at, k[at])
         r = _n_resolved(white(mean, whitener[at][parts.block], sensor), parts, q[at], sensor)
@@ -370,25 +380,25 @@ def _fitted(
     last, settled = np.full(len(q), np.inf), np.zeros(len(q), np.bool_)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own], sensor)
-        U, taken = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own))
+        U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
-            U, taken = _resolved(X, r, parts, sensor)
-        P, g = np.eye(p) - U @ U.conj().swapaxes(1, 2), N / (N - taken)
-        rest = without(X, U)
-        kept = parts.mean(P)
-        T = parts.mean(g[:, None, None] * rest) if resolve else X
+            U, n_own = _resolved(X, r, wanted, parts, sensor)
+        V, g = _leading(U, r[own]), N / (N - np.minimum(n_own, r[own]))
+        kept = parts.mean(np.eye(p) - V @ V.conj().swapaxes(1, 2))
+        T = parts.mean(g[:, None, None] * without(X, V)) if resolve else X
         filled = T + np.eye(p) - kept  # with the noise that resolved directions take
         A = _axes(filled, int(at_most.max()))
         shown = _shown(T, A, kept, resolved=r, wanted=at_most + r, averages=whole, sensor=sensor)
         weak = np.minimum(shown, at_most - r)
-        q, Q = r + weak, P
+        q, g = r + weak, N / (N - n_own)
+        Q = np.eye(p) - U @ U.conj().swapaxes(1, 2)
         if weak.any():
             power = np.maximum((A.conj() * (filled @ A)).real.sum(axis=1) - 1, _FLOOR)
             A = _leading(A * np.sqrt(power)[:, None], shown)
-            PA = _strongest(P @ A[own], weak[own])
-            Q, U = P - PA @ PA.conj().swapaxes(1, 2), np.concatenate([U, PA], axis=2)
-            rest = without(X, U)
+            W = _strongest(Q @ A[own], np.minimum(weak[own], q[own] - n_own))
+            Q, U = Q - W @ W.conj().swapaxes(1, 2), np.concatenate([U, W], axis=2)
+        rest = without(X, U)
         loss = 1 + weak / np.maximum(whole - q, 1.0)
         y = g[:, None] * rest[:, a, b]
         noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
@@ -517,34 +527,92 @@ def _strongest(V: ComplexArray, number: IntArray) -> ComplexArray:
 
 
 def _resolved(
-    X: ComplexArray, r: IntArray, parts: _Parts, sensor: IntArray
-) -> tuple[ComplexArray, FloatArray]:
-    """Return directions of resolved dimensions in each sub-block, and averages that they take.
+    X: ComplexArray, r: IntArray, q: IntArray, parts: _Parts, sensor: IntArray
+) -> tuple[ComplexArray, IntArray]:
+    """Return directions of r of q dimensions in each sub-block, and how many are its own.
 
-    Its own where they stand out. The others are those of the nearest sub-block of its block where
-    all stand out. So are all of them where its own take noise of one sensor almost whole: a line of
-    that sensor stands out in one sub-block, not in the median one, and what is left would be
-    magnified. Directions of other samples let motion of theirs pass.
+    Its own where they stand out, all q where these do whichever sensor is left out. Others of r, of
+    weak motion, are those of the nearest sub-block of its block that has r.
     """
-    p, number = X.shape[1], r[parts.block]
-    U = _leading(_axes(X, int(r.max())), number)
-    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[parts.block] / parts.averages)) ** 2
-    own = (U.conj() * (X @ U)).real.sum(axis=1) > edge[:, None]
-    mine = U * own[:, None]
-    P = np.eye(p) - mine @ mine.conj().swapaxes(1, 2)
-    of = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
-    kept = np.min([np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in of], axis=0)
-    usual = np.array([median(each) for each in np.split(kept, parts.first[1:])])
-    line = kept < HIDES * usual[parts.block]
-    n_own = np.where(line, 0, own.sum(axis=1))
-    whole = n_own == number
-    whole |= ~np.logical_or.reduceat(whole, parts.first)[parts.block]
-    at = np.flatnonzero(~whole)
+    p, most, here = X.shape[1], int(q.max()), parts.block
+    columns = np.arange(most)[::-1]
+    axes = _axes(X, most + 1)
+    power = (axes.conj() * (X @ axes)).real.sum(axis=1)
+    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[here] / parts.averages)) ** 2
+    stands = power > edge[:, None]
+    more = stands[np.arange(len(X)), most - q[here]]
+    whole = ~more & (stands[:, 1:].sum(axis=1) == q[here]) & (r < q)[here]
+    for i in range(0 if are_many(sensor) else int(sensor[-1]) + 1):
+        at = np.flatnonzero(whole)
+        others = np.flatnonzero(sensor != i)
+        w = np.linalg.eigvalsh(X[at][:, others[:, None], others])
+        whole[at] = w[np.arange(len(at)), -np.minimum(q[here[at]], len(others))] > edge[at]
+    number = np.where(whole & (not are_many(sensor)), q[here], r[here])
+    stands = stands[:, 1:] & (columns < number[:, None])
+    U, n_own = axes[:, :, 1:] * stands[:, None], stands.sum(axis=1)
+    _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
+    lacks = r[here] - n_own
+    some = np.logical_or.reduceat(lacks <= 0, parts.first)[here]
+    at = np.flatnonzero(some & (lacks > 0))
     if len(at):
-        mine, theirs = np.where(line[at, None, None], 0, mine[at]), U[_nearest(whole, parts)[at]]
-        rest = theirs - mine @ (mine.conj().swapaxes(1, 2) @ theirs)
-        U[at] = mine + _strongest(rest, number[at] - n_own[at])[:, :, ::-1]
-    return U, np.where(whole, number, np.where(line, -number, n_own)).astype(float)
+        theirs = U[_nearest(lacks <= 0, parts)[at]] * (columns < r[here[at], None])[:, None]
+        rest = theirs - U[at] @ (U[at].conj().swapaxes(1, 2) @ theirs)
+        beside = (np.arange(most) + n_own[at, None]) % most
+        U[at] = U[at] + np.take_along_axis(_strongest(rest, lacks[at]), beside[:, None], axis=2)
+    return U, n_own
+
+
+def _leave_lines(
+    U: ComplexArray,
+    n_own: IntArray,
+    X: ComplexArray,
+    power: FloatArray,
+    *,
+    edge: FloatArray,
+    more: BoolArray,
+    parts: _Parts,
+    sensor: IntArray,
+) -> None:
+    """Replace directions of lines of a sensor by those that the others show; write U and n_own.
+
+    Where directions take noise of one sensor almost whole, or more than all dimensions stand out,
+    there is a line of a sensor, which would be magnified; or a resonance, of which all others show
+    the motion, as much as its directions say. What a sensor shares with the motion of the others is
+    its part in it. Where several have lines, no direction is left.
+    """
+    p = X.shape[1]
+    own = [np.flatnonzero(sensor == i) for i in range(int(sensor[-1]) + 1)]
+    kept = _kept(U, own)
+    usual = np.array([median(each) for each in np.split(kept, parts.first[1:])])[parts.block]
+    at = np.flatnonzero(more | (kept < HIDES * usual))
+    tiny = _SINGULAR * np.einsum("bii->b", X[at]).real
+    inverted = np.linalg.inv(X[at] + tiny[:, None, None] * np.eye(p))
+    alone = [np.linalg.slogdet(inverted[:, c[:, None], c])[1] / len(c) for c in own]
+    loud = np.argmin(alone, axis=0)  # has most that the others do not predict
+    for i in np.unique(loud):
+        here, others = at[loud == i], np.flatnonzero(sensor != i)
+        order, n = np.arange(len(here)), n_own[here]
+        w, V = np.linalg.eigh(X[here][:, others[:, None], others])
+        least = w[order, -np.clip(n, 1, len(others))]
+        felt = U[here][:, others] * np.sqrt(np.maximum(power[here] - 1, 0))[:, None]
+        last = np.linalg.svd(felt, compute_uv=False)[order, np.maximum(n - 1, 0)] ** 2
+        line = more[here] | (least <= edge[here]) | (last < FELT * (least - 1))
+        most = min(U.shape[2], len(others))
+        w, V, here = w[line, -most:], V[line][:, :, -most:], here[line]
+        stands = (w > edge[here, None]) & (np.arange(most)[::-1] < n[line, None])
+        A = X[here][:, :, others] @ (V / np.where(stands, w - 1, np.inf)[:, None])
+        A[:, others] = V * stands[:, None]
+        motion = _strongest(A, stands.sum(axis=1))
+        one = _kept(motion, own[:i] + own[i + 1 :]) >= HIDES * usual[here]
+        U[here], n_own[here] = 0, np.where(one, stands.sum(axis=1), 0)
+        U[here, :, U.shape[2] - most :] = np.where(one[:, None, None], motion, 0)
+
+
+def _kept(U: ComplexArray, own: list[IntArray]) -> FloatArray:
+    """Return the least share of a direction of the noise of one sensor that is not taken."""
+    P = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2)
+    least = [np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own]
+    return np.asarray(np.min(least, axis=0))
 
 
 def _nearest(seen: BoolArray, parts: _Parts) -> IntArray:

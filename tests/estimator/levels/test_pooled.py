@@ -157,6 +157,41 @@ def test_motion_that_differs_between_bins_is_removed(sensors: int, kind: str, ra
     assert abs(np.mean(scores)) < 4 / np.sqrt(n)
 
 
+@pytest.mark.parametrize("sensors", [3, 5])
+@pytest.mark.parametrize("powers", [(1.0, 1.0, 1.0), (10.0, 10.0, 10.0), (1e5, 1e3, 10.0)])
+@pytest.mark.parametrize("kind", ["resonance", "notch", "line"])
+def test_what_differs_in_a_few_bins_of_one_sensor(
+    kind: str, powers: tuple[float, float, float], sensors: int
+) -> None:
+    """Its response, by up to 5 or 1/30, or its noise, by up to 58, which channels share."""
+    held, scores = [], []
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 9])
+        axes = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(sensors)]
+        A = np.concatenate(axes) * np.sqrt(powers) * np.ones((N_BINS, 1, 1), np.complex128)
+        noise = np.eye(3 * sensors) * np.ones((N_BINS, 1, 1))
+        if kind == "line":
+            noise[28:31, :3, :3] += np.outer([7.0, 3.0, 0.0], [7.0, 3.0, 0.0])
+        else:
+            gain = np.array([2.0, 3.0, 5.0, 3.0, 2.0]) ** (1 if kind == "resonance" else -2)
+            A[28:33, :3] *= (gain * np.exp(1j * np.linspace(0, 3, 5)))[:, None, None]
+        found = self_noise(
+            "three-sensor" if sensors == 3 else "maximum-likelihood",
+            drawn(rng, A @ A.conj().swapaxes(1, 2) + noise, 300),
+            dims=(3,) * sensors,
+            n_effective=300,
+            blocks=np.zeros(N_BINS, np.int64),
+        )
+        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
+        low, high = level.interval()
+        true = np.einsum("fcc->fc", noise).mean(axis=0)
+        held.append((low[0] <= true) & (true <= high[0]))
+        scores.append((level.mean[0] - true) / level.spread[0])
+    n = 18 * sensors
+    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / n)
+    assert np.square(scores).mean() < 1 + 4 * np.sqrt(2 / n)
+
+
 def test_each_block_has_the_dimensions_of_its_own_motion() -> None:
     """Strong motion, none, and motion again: none of it is in the noise of its neighbours."""
     rng = np.random.default_rng(3)
