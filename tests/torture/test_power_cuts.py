@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -42,19 +44,17 @@ def test_nothing_acknowledged_is_lost(
 def test_without_its_journal_a_torn_recording_is_lost(
     operations: list[Operation], tmp_path: Path
 ) -> None:
-    """Shows that the cuts above tear recordings at all."""
+    """Shows that the cuts above tear recordings at all; one may end the HDF5 library, too."""
     lost = 0
-    for number in range(40):
+    for number in range(20):
         disk = tmp_path / str(number)
         disk.mkdir()
         rng = np.random.default_rng(number)
         n = int(rng.integers(len(operations) // 3, len(operations)))
         replay(operations, n, "sectors", rng, disk)
         journal_path(disk / "r.h5").unlink(missing_ok=True)
-        try:
-            repair(disk / "r.h5")
-        except RecordingError:
-            lost += 1
+        command = [sys.executable, "-P", "-m", "tui", "repair", str(disk / "r.h5")]
+        lost += bool(subprocess.run(command, check=False, capture_output=True).returncode)
     assert lost > 0
 
 
