@@ -377,7 +377,6 @@ def _fitted(
     r, wanted = np.zeros(len(q), np.int64), q
     at_most = np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
-    last, settled = np.full(len(q), np.inf), np.zeros(len(q), np.bool_)
     for turn in range(ROUNDS):
         X = white(mean, whitener[own], sensor)
         U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
@@ -407,10 +406,6 @@ def _fitted(
         floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
         size, axes = axes_of(noise, floor, sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
-        change = np.abs(step).max(axis=1)
-        # a weak dimension may turn ever more into one sensor's noise, which then seems to vanish
-        settled |= (change > last) & (turn > 1)
-        step[settled], last = 0, change
         if turn == ROUNDS - 1 or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
             break
         shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
@@ -589,7 +584,7 @@ def _leave_lines(
     inverted = np.linalg.inv(X[at] + tiny[:, None, None] * np.eye(p))
     alone = [np.linalg.slogdet(inverted[:, c[:, None], c])[1] / len(c) for c in own]
     loud = np.argmin(alone, axis=0)  # has most that the others do not predict
-    for i in np.unique(loud):
+    for i in sorted(set(loud.tolist())):
         here, others = at[loud == i], np.flatnonzero(sensor != i)
         order, n = np.arange(len(here)), n_own[here]
         w, V = np.linalg.eigh(X[here][:, others[:, None], others])
