@@ -26,6 +26,8 @@ __all__ = ["METHODS", "Flag", "Method", "SelfNoise", "self_noise"]
 
 SMOOTH = 400.0
 """Averages on which the course of the noise in a block rests."""
+BENT = 1.5
+"""Mean of the channels over their median, above which one of them bends their course."""
 
 Method: TypeAlias = "Callable[..., SelfNoise]"
 """``method(csm, *, dims, n_effective, correct, **options)``."""
@@ -197,7 +199,9 @@ def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: floa
     def mean(each: FloatArray) -> FloatArray:
         return np.asarray((np.add.reduceat(each, first) / count[:, None])[block])
 
-    course = median((rest / mean(rest)).T)
+    each = rest / mean(rest)
+    course, usual = each.mean(axis=1), median(each.T)
+    course = np.where(course > BENT * usual, usual, course)
     half = int(SMOOTH / n_effective / 2)
     begin = np.maximum(np.arange(len(psd)) - half, first[block])
     end = np.minimum(np.arange(len(psd)) + half + 1, (first + count)[block])
