@@ -95,7 +95,7 @@ SAMPLED = 15
 """Sub-blocks of a block by which the number of resolved dimensions is decided."""
 _STEP = 1.5  # of the log of the noise in one round
 _FLOOR = 1e-7  # of the noise over the PSD
-_TINY = 1e-300
+_ROUNDING = 1e-14  # of the square of the largest singular value
 _SINGULAR = 1e-15  # of the PSD, added before the inverse at first
 _BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
 _TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
@@ -300,8 +300,7 @@ def _pool(
     parts, mean = cut(at, k)
     X = white(mean, whitener[parts.block], sensor)
     axis = _axes(X, 1)
-    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[parts.block] / parts.averages)) ** 2
-    stands = np.einsum("bpi,bpq,bqi->b", axis.conj(), X, axis).real > edge
+    stands = np.einsum("bpi,bpq,bqi->b", axis.conj(), X, axis).real > _edge(p, parts)
     best[np.logical_or.reduceat(stands, parts.first)] = -1
     parts, mean = cut(at, largest)
     r = _n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor)
@@ -515,10 +514,13 @@ def _leading(axes: ComplexArray, number: IntArray) -> ComplexArray:
 
 
 def _strongest(V: ComplexArray, number: IntArray) -> ComplexArray:
-    """Return so many left singular vectors of the largest singular values; others are zero."""
+    """Return so many left singular vectors of the largest singular values; others are zero.
+
+    So are those of no more than rounding, of directions that a projection has taken off.
+    """
     w, turn = np.linalg.eigh(V.conj().swapaxes(1, 2) @ V)
-    turn = turn * (np.arange(w.shape[1])[::-1] < number[:, None])[:, None]
-    return np.asarray(V @ (turn / np.sqrt(np.maximum(w, _TINY))[:, None]))
+    some = (np.arange(w.shape[1])[::-1] < number[:, None]) & (w > _ROUNDING * w[:, -1:])
+    return np.asarray(V @ (turn * (some / np.sqrt(np.where(some, w, 1.0)))[:, None]))
 
 
 def _resolved(
@@ -533,16 +535,17 @@ def _resolved(
     columns = np.arange(most)[::-1]
     axes = _axes(X, most + 1)
     power = (axes.conj() * (X @ axes)).real.sum(axis=1)
-    edge = OUTSTANDING * (1 + np.sqrt(p * parts.fewer[here] / parts.averages)) ** 2
+    edge = _edge(p, parts)
     stands = power > edge[:, None]
     more = stands[np.arange(len(X)), most - q[here]]
     whole = ~more & (stands[:, 1:].sum(axis=1) == q[here]) & (r < q)[here]
-    for i in range(0 if are_many(sensor) else int(sensor[-1]) + 1):
+    whole &= not are_many(sensor)  # it would cost too much
+    for i in range(int(sensor[-1]) + 1):
         at = np.flatnonzero(whole)
         others = np.flatnonzero(sensor != i)
         w = np.linalg.eigvalsh(X[at][:, others[:, None], others])
         whole[at] = w[np.arange(len(at)), -np.minimum(q[here[at]], len(others))] > edge[at]
-    number = np.where(whole & (not are_many(sensor)), q[here], r[here])
+    number = np.where(whole, q[here], r[here])
     stands = stands[:, 1:] & (columns < number[:, None])
     U, n_own = axes[:, :, 1:] * stands[:, None], stands.sum(axis=1)
     _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
@@ -601,6 +604,11 @@ def _leave_lines(
         one = _kept(motion, own[:i] + own[i + 1 :]) >= HIDES * usual[here]
         U[here], n_own[here] = 0, np.where(one, stands.sum(axis=1), 0)
         U[here, :, U.shape[2] - most :] = np.where(one[:, None, None], motion, 0)
+
+
+def _edge(p: int, parts: _Parts) -> FloatArray:
+    """Return the eigenvalue of each sub-block of p channels above which motion stands out."""
+    return OUTSTANDING * (1 + np.sqrt(p * parts.fewer[parts.block] / parts.averages)) ** 2
 
 
 def _kept(U: ComplexArray, own: list[IntArray]) -> FloatArray:
