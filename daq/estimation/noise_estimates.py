@@ -529,7 +529,7 @@ def noise_estimates(
     shared: Sequence[tuple[int, int]] = (),
     chosen: bool = False,
     stability: Stability | None = None,
-    before: tuple[Mapping[str, SelfNoise], Stability | None] | None = None,
+    levels: bool = True,
 ) -> Estimates:
     """Estimate by every method that is wanted.
 
@@ -555,8 +555,8 @@ def noise_estimates(
         three-sensor is the paper's formula.
     stability : Stability, optional
         Of these averages: where noise changes, fewer averages tell it from motion.
-    before : mapping of str to SelfNoise, with the stability that these rest on, optional
-        Results of the only band, else alike: they stay where the inflation does.
+    levels : bool
+        Whether noise is estimated at all: without it, only the dimension of the motion.
     """
     chosen, known = chosen or "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
@@ -564,7 +564,11 @@ def noise_estimates(
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
     changing: MultiPart | None = None
-    wanted = list(ALL_METHODS if "all" in settings.methods else settings.methods)
+    wanted = [
+        each
+        for each in (ALL_METHODS if "all" in settings.methods else settings.methods)
+        if levels or each == "maximum-likelihood"
+    ]
     with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
         for method in wanted:
             try:
@@ -586,16 +590,13 @@ def noise_estimates(
                         }
                         for q, band in zip(dimensions.n_factors, bands, strict=True)
                     ]
+                if not levels:
+                    continue
                 if method == "maximum-likelihood":
                     options = [option | {"maxima": maxima} for option in options]
                 engine = chosen or method == "maximum-likelihood"
                 given: Sequence[SelfNoise | None] = known.get(method, ()) or [None] * len(bands)
                 blocks = [blocks_of(band.frequencies) if engine else None for band in bands]
-                if before is not None and method in before[0]:
-                    given = [before[0][method]]
-                    changed = inflations[0] != _inflation(bands[0], before[1])
-                    if (of := blocks[0]) is not None:
-                        blocks = [np.where(np.isin(of, of[changed]), of, -1)]
                 parts = [
                     self_noise(
                         method,

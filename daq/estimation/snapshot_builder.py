@@ -74,7 +74,6 @@ from daq.protocols.block import Event, Quantity, Reading
 from daq.recording.interface import ReadableRecording
 from estimator.checks.advice import Untested
 from estimator.checks.disturbed_segments import SegmentCourse
-from estimator.checks.stability import Stability
 from estimator.checks.steadied import Steadied
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
@@ -229,7 +228,6 @@ class SnapshotBuilder:
         self._outgrown: Callable[[], Dimensions] | None = None
         self._choice = _Beside()
         self._findings = Findings()
-        self._stability_known = self._findings.stability
         self._diagnoses = Throttle(diagnosis_share)
         self._choices = Throttle(1.0)  # limited by `_RECHOICE`
         self._occasional_cost = 0.0
@@ -265,12 +263,10 @@ class SnapshotBuilder:
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_unused = sum(each.n_segments for each in passes), 0
-        maxima = Maxima()
         if final and csm.nbytes > FREED_FROM:
             give_back()
-        estimates = self._estimates(
-            bands, raw, recordings[0], first, n_segments, maxima=maxima, final=final
-        )
+        of_all, maxima = (bands, raw, recordings[0], first, n_segments), Maxima()
+        estimates = self._estimates(*of_all, maxima=maxima, final=final, levels=bool(sets))
         if sets:
             estimates, sets = with_sets(
                 estimates,
@@ -303,9 +299,7 @@ class SnapshotBuilder:
                 )
             self._occasional_cost += self._diagnoses.cost
         if not sets:
-            estimates = self._beside_changing_noise(
-                bands, raw, recordings[0], first, estimates, maxima=maxima
-            )
+            estimates = self._levels(estimates.dimensions, of_all, maxima)
         diagnostics = SnapshotDiagnostics(
             synchronisation=bias_of_clocks(
                 synchronisation(passes),
@@ -372,30 +366,15 @@ class SnapshotBuilder:
         )
         return with_contributions(snapshot)
 
-    def _beside_changing_noise(
+    def _levels(
         self,
-        bands: tuple[Band, ...],
-        raw: tuple[Band, ...],
-        recording: ReadableRecording,
-        first: Pass,
-        estimates: Estimates,
-        *,
+        found: Dimensions | None,
+        of_all: tuple[tuple[Band, ...], tuple[Band, ...], ReadableRecording, Pass, int],
         maxima: Maxima,
     ) -> Estimates:
-        """Return estimates of noise that is found to change, without dimensions that are noise."""
-        steady = self._findings.stability
-        self._dimensions = beside_changing_noise(estimates.dimensions, bands, steady)
-        changes = (
-            steady is not None and steady.inflation > 1 and steady is not self._stability_known
-        )
-        if self._dimensions is estimates.dimensions and not changes:
-            return estimates
-        n, before = bands[-1].n_segments, None
-        if self._dimensions is estimates.dimensions and len(bands) == 1:
-            before = estimates.results, self._stability_known
-        return self._estimates(
-            bands, raw, recording, first, n, maxima=maxima, final=False, before=before
-        )
+        """Estimate beside noise that the diagnosis finds to change, without dimensions that are."""
+        self._dimensions = beside_changing_noise(found, of_all[0], self._findings.stability)
+        return self._estimates(*of_all, maxima=maxima, final=False)
 
     def _within_parts(
         self,
@@ -499,9 +478,12 @@ class SnapshotBuilder:
         *,
         maxima: Maxima,
         final: bool,
-        before: tuple[Mapping[str, SelfNoise], Stability | None] | None = None,
+        levels: bool = True,
     ) -> Estimates:
-        """Estimate; while following, the dimension of the motion is the one chosen before."""
+        """Estimate; while following, the dimension of the motion is the one chosen before.
+
+        Without `levels`, the dimension alone.
+        """
         if not bands:
             return Estimates({}, {}, None)
         dims = first.aligned.dims
@@ -509,7 +491,6 @@ class SnapshotBuilder:
         if self._choice.is_made:
             self._dimensions, self._chosen_at = self._choice.taken(self._dimensions), self._grown_to
         keep = not final and self._fits(bands)
-        self._stability_known = self._findings.stability
         with self._choices:
             estimates = noise_estimates(
                 bands,
@@ -521,8 +502,8 @@ class SnapshotBuilder:
                 known=self._known(bands, raw),
                 maxima=maxima,
                 shared=self._pairs,
-                stability=self._stability_known,
-                before=before,
+                stability=self._findings.stability,
+                levels=levels,
             )
         if estimates.dimensions is not self._dimensions:
             self._dimensions, self._chosen_at = estimates.dimensions, n_segments

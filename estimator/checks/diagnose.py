@@ -473,7 +473,7 @@ def _fit(
     try:
         return joined(
             [
-                maxima.maximise(testable(part.block(some), frequency[some]), q, last=True)
+                maxima.maximise(testable(part.block(some), frequency[some]), q)
                 for some in blocks(len(frequency), n_channels)
             ]
         )

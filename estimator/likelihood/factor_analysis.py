@@ -305,21 +305,17 @@ class Maxima:
         n_factors: int,
         *,
         dims: tuple[int, ...] | None = None,
-        last: bool = False,
     ) -> Maximum:
-        """Return `maximise` without a penalty, of some matrices perhaps from before.
-
-        Nothing is kept of those that are wanted the `last` time.
-        """
+        """Return `maximise` without a penalty, of some matrices perhaps from before."""
         keys = [  # no minus zeros
             (n_factors, dims, sha256(np.add(each, 0.0, order="C").data).digest()) for each in csm
         ]
-        before = [self._found.pop(key, None) if last else self._found.get(key) for key in keys]
+        before = [self._found.get(key) for key in keys]
         missing = [row for row, each in enumerate(before) if each is None]
         if missing or not len(csm):
             wanted = csm if len(missing) == len(csm) else csm[missing]
             new = maximise(wanted, n_factors, dims=dims)
-            if not last and self._bytes + new.rest.nbytes <= KEPT_BYTES:
+            if self._bytes + new.rest.nbytes <= KEPT_BYTES:
                 self._bytes += new.rest.nbytes
                 self._found |= {keys[row]: (new, at) for at, row in enumerate(missing)}
             if len(missing) == len(csm):
