@@ -44,7 +44,9 @@ def inverse(J: ComplexArray) -> ComplexArray:
 
 def _scaled(J: ComplexArray) -> tuple[ComplexArray, FloatArray]:
     D = np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
-    return J / (D[:, :, None] * D[:, None, :]) + _RIDGE * np.eye(J.shape[1]), D
+    scaled = J / (D[:, :, None] * D[:, None, :])
+    np.einsum("bii->bi", scaled)[:] += _RIDGE
+    return scaled, D
 
 
 def are_many(sensor: IntArray) -> bool:
@@ -62,7 +64,12 @@ def coupling_beside(U: ComplexArray, sensor: IntArray) -> ComplexArray:
     coupling is ``V V*`` and one block ``1 - G x 1 - 1 x conj(G)`` for each sensor.
     """
     if not are_many(sensor):
-        return coupling(np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2), *pairs(sensor))
+        Q, counts = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2), np.bincount(sensor)
+        if (counts != counts[0]).any():
+            return coupling(Q, *pairs(sensor))
+        Q = Q.reshape(len(U), len(counts), counts[0], 1, len(counts), counts[0], 1)
+        J = Q * Q.conj().swapaxes(2, 3).swapaxes(5, 6)  # without gathering elements
+        return J.reshape(len(U), *[sum(counts**2)] * 2)
     local, V, within = _beside(U, sensor)
     J = V @ V.conj().swapaxes(1, 2)
     J[:, *within] += local
@@ -188,9 +195,12 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
     n, p = weight.shape[:2]
     a, b = pairs(sensor)
     if not are_many(sensor):
-        C = np.zeros((n, p, p, p), np.complex128)
-        C[:, :, b, a] = weight
-        B = (C + C.conj().swapaxes(2, 3)) / 2 @ projected[:, None]
+        B = np.empty((n, p, p, p), np.complex128)
+        for i, d in enumerate(np.bincount(sensor).tolist()):
+            own = sensor == i
+            C = weight[:, :, own[a]].reshape(n, p, d, d)
+            C = (C.swapaxes(2, 3) + C.conj()) / 2
+            B[:, :, own] = (C.reshape(n, p * d, d) @ projected[:, own]).reshape(n, p, d, p)
         twice = B @ B
         return np.stack([_along(B, B), _along(B, twice), _along(twice, twice)])
     n_sensors, d = int(sensor[-1]) + 1, p // (int(sensor[-1]) + 1)
@@ -241,7 +251,8 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
 
 def _along(one: ComplexArray, other: ComplexArray | FloatArray) -> FloatArray:
     """Return the real trace of the product of matrices, shape (n, p)."""
-    return np.asarray(np.einsum("...ml,...lm->...", one, other).real)
+    turned = other.swapaxes(-1, -2).reshape(*other.shape[:-2], -1, 1)
+    return np.asarray((one.reshape(*one.shape[:-2], 1, -1) @ turned)[..., 0, 0].real)
 
 
 def times(matrices: ComplexArray, vectors: ComplexArray) -> ComplexArray:

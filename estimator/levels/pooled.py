@@ -98,7 +98,7 @@ _FLOOR = 1e-7  # of the noise over the PSD
 _ROUNDING = 1e-14  # of the square of the largest singular value
 _SINGULAR = 1e-15  # of the PSD, added before the inverse at first
 _BYTES_AT_ONCE = 1 << 23  # of the matrices of blocks that are fitted together
-_TRACE_BYTES = 1 << 24  # of products of all channels' differentials that exist together
+_TRACE_BYTES = 1 << 24, 1 << 20  # of differentials' products that exist together: many, few
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,8 +299,11 @@ def _pool(
     # what the largest sub-blocks do not resolve, smaller ones do not either, but for a few
     parts, mean = cut(at, k)
     X = white(mean, whitener[parts.block], sensor)
-    axis = _axes(X, 1)
-    stands = np.einsum("bpi,bpq,bqi->b", axis.conj(), X, axis).real > _edge(p, parts)
+    stands = np.einsum("bii->bi", X).real.max(axis=1) > _edge(p, parts)  # a bound of eigenvalues
+    open_ = ~np.logical_or.reduceat(stands, parts.first)[parts.block]
+    axis = _axes(X[open_], 1)
+    power = (axis.conj() * (X[open_] @ axis)).real.sum(axis=(1, 2))
+    stands[open_] = power > _edge(p, parts)[open_]
     best[np.logical_or.reduceat(stands, parts.first)] = -1
     parts, mean = cut(at, largest)
     r = _n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor)
@@ -774,7 +777,7 @@ def _traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> 
     C_i, whose elements are `weight`, one block for each sensor.
     """
     n, p = weight.shape[:2]
-    step = max(1, _TRACE_BYTES // (16 * p**3))
+    step = max(1, _TRACE_BYTES[not are_many(sensor)] // (16 * p**3))
     parts = [
         traces(weight[low : low + step], projected[low : low + step], sensor)
         for low in range(0, max(n, 1), step)

@@ -383,13 +383,12 @@ def _inverted(matrices: ComplexArray) -> tuple[FloatArray, ComplexArray]:
     bounds its eigenvalues.
     """
     p = matrices.shape[1]
-    if p > WHOLE:
-        with suppress(np.linalg.LinAlgError):
-            np.linalg.cholesky(matrices)
-            found: ComplexArray = np.asarray(np.linalg.inv(matrices), np.complex128)
-            bound: FloatArray = np.asarray(1 / np.einsum("fii->f", found).real, np.float64)
-            if bound.min(initial=1.0) > _SAFE:
-                return bound, found
+    with suppress(np.linalg.LinAlgError):
+        np.linalg.cholesky(matrices)
+        found: ComplexArray = np.asarray(np.linalg.inv(matrices), np.complex128)
+        bound: FloatArray = np.asarray(1 / np.einsum("fii->f", found).real, np.float64)
+        if bound.min(initial=1.0) > _SAFE:
+            return bound, found
     least: FloatArray = np.asarray(np.linalg.eigvalsh(matrices)[:, 0], np.float64)
     regular = least > 4 * p * np.finfo(np.float64).eps
     found = np.asarray(
