@@ -5,8 +5,9 @@ Each is a `HuddleError`, and also an instance of the matching standard exception
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+
+from estimator.records import dataclass
 
 ABSENT: object = object()
 """Stands for a value that is missing in a file."""

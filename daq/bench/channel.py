@@ -6,8 +6,9 @@ The table of a bench file is checked by `daq.bench.model`, which makes these of 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     import datetime as dt

@@ -6,9 +6,10 @@ service that is closed and opened again changes nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from daq.bench.durations import format_duration, parse_duration
+from estimator.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

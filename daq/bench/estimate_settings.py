@@ -7,12 +7,13 @@ add a field here and use it in `daq.estimation`. This module imports nothing hea
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, field, fields
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from daq.bench import option_values as values
 from daq.bench.durations import format_duration, parse_duration
+from estimator.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import EstimateSettings
 from daq.bench.option_values import one_of
+from estimator.records import dataclass
 
 MIN_SEGMENT_SAMPLES = 4
 """Samples of a segment, for one frequency between 0 and half the sampling rate."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from daq.bench.estimate_settings import OPTIONS, EstimateSettings, table_keys
 from daq.bench.sensitivity import Sensitivities, known_sensitivities
 from daq.bench.tables.toml_text import checked_table
+from estimator.records import dataclass
 
 
 @dataclass(frozen=True, slots=True)

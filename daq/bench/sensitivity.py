@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeAlias
+
+from estimator.records import dataclass
 
 REFERENCE_TEMPERATURE = 23.0
 """In °C, at which a sensitivity holds where the data sheet states no other."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.errors import WrongSettingError
+from estimator.records import dataclass
 
 STANDARD_GRAVITY = 9.80665
 """In m/s²."""

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,7 @@ from daq.clocks.sensor_reader import SensorSource, main_columns
 from daq.clocks.slips import Slip, Step, arrive_otherwise, lost_by_delays, steps
 from daq.errors import CannotAlignError
 from daq.recording.interface import ReadableRecording
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

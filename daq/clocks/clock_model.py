@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import StrEnum
 from math import inf, isnan
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from daq.clocks.slips import Slips
 from daq.protocols.block import Uncounted
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.clocks.clock_model import Clock, ClockSource, ClockState, Epoch, MeasuredDelays
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 

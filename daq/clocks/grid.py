@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from daq.clocks.resampling import SPAN, all_present, reach, resample
 from daq.clocks.sensor_reader import SensorSource
 from daq.errors import CannotAlignError
 from daq.recording.interface import ReadableSensor
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

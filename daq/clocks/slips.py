@@ -17,13 +17,13 @@ the count goes on with the lost samples added, so that the clock needs no new st
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.clocks.lower_envelope import least_of_each
 from daq.clocks.quantiles import median
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

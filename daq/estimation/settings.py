@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from daq.errors import WrongSettingError
 from estimator.errors import EstimatorError
 from estimator.levels.contributions import across
 from estimator.likelihood.dimension import has_room
+from estimator.records import dataclass
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import h5py
@@ -11,6 +10,7 @@ import numpy as np
 
 from daq.bench.channel import Channel
 from daq.caveats import Caveat
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from daq.bench.end_condition import NEVER, EndCondition
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.protocols.block import BlockFlag, Event
 from daq.recording.sensor_state import STATE_AFTER, SensorState
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

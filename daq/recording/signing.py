@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from daq.recording.chunks.manifest import root_sha256
 from daq.recording.reader import Recording
 from daq.recording.storage.opening import open_file
 from daq.whole_file import PRIVATE, write_whole
+from estimator.records import dataclass
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench

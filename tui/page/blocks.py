@@ -6,9 +6,9 @@ is plain: who writes it escapes it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
+from estimator.records import dataclass
 from tui.page.table import Table, Tone
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ import io
 import shlex
 import stat
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 
 from daq.errors import NotARecordingError, RecordingError
 from daq.foreign_files import import_command
+from estimator.records import dataclass
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FIELDS = struct.Struct("<8sBBBBQQQQ")
