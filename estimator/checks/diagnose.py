@@ -76,6 +76,8 @@ LEAST_KNOWN = 0.2
 """Standard error of a part's noise, as a fraction, up to which changes are reported."""
 LARGE = 0.5
 SMALL = 0.05
+PARTNERS = 6
+"""Sensors, spread over the bench, with which each sensor is compared."""
 
 
 def changes(
@@ -177,7 +179,7 @@ class Diagnostics:
         Why the model was tested at no frequency; None if it was tested.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
-        Relative responses of the comparable pairs: sensors with all their channels.
+        Of the comparable pairs, sensors with all their channels, of which one is among `PARTNERS`.
     advice : tuple of Advice
         Most severe first.
     stability : Stability or None
@@ -505,6 +507,19 @@ def _test(
     return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
 
 
+def _compared(there: PresentSensors, found: list[RelativeResponse]) -> Iterator[tuple[int, int]]:
+    """Yield like sensors, one of them among `PARTNERS`; the first with a response is always."""
+    for d in sorted(set(there.dims)):  # motion along a missing channel is unknown
+        whole = [n for n, s in enumerate(there.sensors) if s in there.whole and there.dims[n] == d]
+        before = len(found)
+        for pair in combinations(whole, 2):
+            if len(found) == before and pair[0] != whole[0]:
+                whole = whole[1:]
+            spread = np.linspace(0, len(whole) - 1, PARTNERS).astype(np.int64)
+            if not {whole[n] for n in spread}.isdisjoint(pair):
+                yield pair
+
+
 def _responses(
     csm: ComplexArray,
     checked: Coherency,
@@ -514,15 +529,13 @@ def _responses(
     vertical: int | None,
     coherence: CanonicalCoherence,
 ) -> tuple[RelativeResponse, ...]:
-    found = []
+    found: list[RelativeResponse] = []
     if len(there.channels) < csm.shape[1] and len(there.whole) > 1:
         csm = csm[np.ix_(range(len(csm)), there.channels, there.channels)]
         checked = coherency(csm, there.dims)
     products = PairProducts(csm, there.dims)
-    for first, second in combinations(range(len(there.sensors)), 2):
+    for first, second in _compared(there, found):
         pair = there.sensors[first], there.sensors[second]
-        if not set(pair) <= set(there.whole):  # motion along a missing channel is unknown
-            continue
         with suppress(InsufficientDataError):  # not comparable
             response = relative_response(
                 csm,

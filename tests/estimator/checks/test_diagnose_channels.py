@@ -48,6 +48,19 @@ def test_a_dead_channel_leaves_the_rest_of_the_bench_its_diagnostics() -> None:
     assert {(r.first, r.second) for r in found.responses} == {(0, 2), (0, 3), (2, 3)}
 
 
+def test_each_of_many_sensors_is_compared_with_some_spread_over_the_bench() -> None:
+    csm = averages(bench(*[np.eye(3)] * 9))
+    csm[:, :3, 3:] = csm[:, 3:, :3] = 0  # the first shares no motion
+    found = diagnose(csm, FREQUENCY, dims=(3,) * 9, n_effective=1080, neighbours=INDEPENDENT)
+    pairs = {(each.first, each.second) for each in found.responses}
+    assert all(0 not in pair for pair in pairs)
+    assert {(1, each) for each in range(2, 9)} <= pairs  # all with the first that compares
+    partners = {1, 2, 3, 5, 6, 8}
+    assert pairs == {(j, k) for k in range(2, 9) for j in range(1, k) if {j, k} & partners}
+    gains = {pair.gains.round(1).tobytes() for pair in found.responses}
+    assert gains == {np.ones(3).tobytes()}
+
+
 def test_a_signal_connected_twice_is_reported_with_its_copy() -> None:
     csm = averages(bench(*[np.eye(3)] * 3))
     csm[:, 4, :] = csm[:, 1, :]
