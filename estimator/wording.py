@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import accumulate
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,3 +96,11 @@ def span(low: float, high: float) -> str:
 def listed(words: Sequence[str], conjunction: str = "and") -> str:
     """Return words as a list with "and"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {conjunction} {words[-1]}"
+
+
+def few(words: Sequence[str], conjunction: str = "and", *, room: int = 36) -> str:
+    """Return a list of the first words that fit into `room` characters, and how many are left."""
+    ends = accumulate(len(word) + len(", ") for word in words)
+    shown = list(words[: max(1, sum(end <= room for end in ends))])
+    left = len(words) - len(shown)
+    return listed([*shown, f"{left} more"] if left else shown, conjunction)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Seconds, Share, record
-from estimator.wording import Words, listed, percent, several, time_of_day
+from estimator.wording import Words, few, listed, percent, several, time_of_day
 
 LARGE_FALL = -0.8
 """Change of a gain, of its mean over the segments, below which its size is not known."""
@@ -51,9 +51,7 @@ class SharedNoise(Advice):
         return max(known, default=0.0)
 
     def _words(self, names: Names) -> Words:
-        harm = (
-            "" if self.rank is Rank.TO_KNOW else f", which biases estimates by {percent(self.harm)}"
-        )
+        harm = "" if self.rank is Rank.TO_KNOW else f" (bias {percent(self.harm)})"
         pairs = _pairs(self.channels + self.alternatives, names)
         coherencies = [
             f"{pair} {100 * amount:.2g} ± {100 * error:.1g} %"
@@ -69,7 +67,8 @@ class SharedNoise(Advice):
             else ""
         )
         return Words(
-            f"{listed(pairs, 'or' if self.alternatives else 'and')} share noise{harm}",
+            f"{few(pairs, 'or' if self.alternatives else 'and')} share noise{harm}: check cables "
+            "and digitizer",
             f"{whose} {names.list_sensors(self.sensors)} share noise at {self.where} "
             f"({', '.join(coherencies)} of the noise).{instead} {_effect(self, names)}",
             "Check what these channels have in common: digitizer, power supply, ground, cable, "

@@ -8,7 +8,7 @@ from typing import ClassVar, Self, TypeVar
 
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Seconds, record
-from estimator.wording import Words, degrees, listed, percent, ratio, signed
+from estimator.wording import Words, degrees, few, listed, percent, ratio, signed
 
 Pairwise = TypeVar("Pairwise", bound=Advice)
 
@@ -56,7 +56,7 @@ class SwappedChannels(Advice):
 
     def _words(self, names: Names) -> Words:
         return Words(
-            f"Channels are swapped: {listed(followers(self, names))}; check cables and bench file",
+            f"Channels are swapped: {few(followers(self, names))}; check cables",
             f"Channels are swapped: {listed(followers(self, names))}. A {ANY_AXES} estimate is "
             "unbiased but carries the wrong channel names, and other methods compare channels "
             "that do not correspond.",
@@ -288,7 +288,7 @@ class UnequalResponses(Advice):
     unproven: tuple[int, ...] = ()
 
     def _words(self, names: Names) -> Words:
-        line = f"The response of {names.list_sensors(self.sensors)} differs"
+        line = f"The response of {few([names.sensors[each] for each in self.sensors])} differs"
         if self.equalised_by and self.rank is Rank.TO_KNOW:
             line += ", and was equalised"
         else:

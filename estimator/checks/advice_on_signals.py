@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from estimator.checks.advice import Advice, Names
 from estimator.records import record
-from estimator.wording import Words, listed, percent
+from estimator.wording import Words, few, listed, percent
 
 
 @record
@@ -35,8 +35,8 @@ class NoSignal(Advice):
             who = names.list_sensors(self.sensors)
             what = f"Sensor {who} has no signal on any channel"
         else:
-            who = listed([names.channels[channel] for channel in self.channels])
-            what = f"{who} {have} no signal"
+            channels = [names.channels[channel] for channel in self.channels]
+            who, what = few(channels), f"{listed(channels)} {have} no signal"
         return Words(
             f"{who}: no signal; check cable and power",
             f"{what} (no power, or a constant count): {whose} noise cannot be estimated.",
@@ -98,10 +98,10 @@ class NoSharedMotion(Advice):
     def _words(self, names: Names) -> Words:
         line = (
             f"{names.list_sensors(self.sensors)} records none of the motion that "
-            f"{names.list_sensors(self.partners)} share: check its input or its place"
+            f"{few([names.sensors[each] for each in self.partners])} share: check its input or "
+            "its place"
         )
         partners = names.list_sensors(self.partners)
-        few = len(self.partners) < 3
         if self.for_part:
             return Words(
                 line,
@@ -119,7 +119,7 @@ class NoSharedMotion(Advice):
             + (
                 f", and {partners} have no third sensor. Or {partners} share noise: the intervals "
                 "reach up to all of it."
-                if few
+                if len(self.partners) < 3
                 else "."
             ),
             "Check its input and its place: it must stand beside the others on the same floor.",

@@ -229,8 +229,7 @@ def show_result(
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
     from tui.output.standing import standing
-    from tui.wording.facts import NOTHING_TO_DO, brief
-    from tui.wording.verdict_text import STYLES, Decision, limit_line
+    from tui.wording.verdict_text import STYLES, Decision, facts_below, limit_line
 
     snapshot, screen = result.snapshot, for_people(json, csv)
     table = result_table(result)  # refuses a band without frequencies
@@ -244,9 +243,7 @@ def show_result(
         screen.print(line)
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
-    facts = result.facts
-    is_open = decision is not None and decision.next_step != NOTHING_TO_DO
-    for part in details(snapshot, facts) if diagnostics else brief(facts, is_open=is_open):
+    for part in details(snapshot, result.facts) if diagnostics else facts_below(result):
         screen.print(part)
     for part in standing(result, width=screen.width) if diagnostics else ():
         screen.print(part)

@@ -173,7 +173,7 @@ def _update(result: Result, now: RecordingStatus | None) -> dict[str, Any]:
             for sensor in (() if now is None else now.sensors)
         },
         "left_out": snapshot.left_out,
-        **verdict_document(result.verdict),
+        **verdict_document(result),
     }
     if snapshot.results:
         document["band_hz"] = result.band

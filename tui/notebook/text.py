@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from estimator.decision.verdict import Verdict
 from estimator.errors import BandError
 from tui.output.results import averages_line, result_table, result_title
 from tui.page import html as page
 from tui.page.blocks import Paragraph, Part
 from tui.page.table import Table
 from tui.page.terminal import terminal_table
-from tui.wording.facts import brief
 from tui.wording.formatting import level, level_with_error
-from tui.wording.verdict_text import Decision
+from tui.wording.verdict_text import Decision, facts_below
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,9 +39,7 @@ def text(result: Result) -> str:
         ]
     except BandError as error:
         return rendered([Text(f"Self-noise: {error}"), Text(averages_line(result.snapshot))])
-    is_open = result.verdict is not None and result.verdict.verdict is not Verdict.PASS
-    more = "print(*result.facts, sep='\\n')"
-    parts += map(Text, brief(result.facts, more, is_open=is_open))
+    parts += map(Text, facts_below(result, "print(*result.facts, sep='\\n')"))
     return rendered(parts)
 
 

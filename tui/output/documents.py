@@ -301,9 +301,19 @@ class LimitMargins(TypedDict):
     margin_high_db: Annotated[float, "The margin at the lower end; null where that is not above 0."]
 
 
+class DecisionDocument(TypedDict):
+    """What a test comes to, in words; they can change between versions."""
+
+    state: Verdict
+    reason: Annotated[str, "The verdict in a sentence."]
+    next_step: Annotated[str, "What to do first, with the fact that needs it."]
+    remarks: Annotated[Sequence[str], "What else to do, and what is not judged."]
+
+
 class VerdictDocument(TypedDict):
     """Verdict on the limits of the bench file."""
 
+    decision: Annotated[DecisionDocument | None, "First line of other output; null without limits."]
     verdict: Annotated[
         Verdict | None, "Verdict on the limits of the bench file; null without limits."
     ]

@@ -25,6 +25,7 @@ from tui import __version__
 from tui.output.calibration import channels_of
 from tui.output.json_values import json_text, plain
 from tui.output.noise_parameters import noise_parameters_document
+from tui.wording.verdict_text import Decision
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
         Synchronisation,
     )
     from daq.results.calibration import Calibration
-    from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
     from tui.output.documents import (
@@ -104,7 +104,7 @@ def document(
         "settings": _settings(result),
     }
     whole |= documents[0] if len(documents) == 1 else {"results": documents}
-    whole |= verdict_document(result.verdict)
+    whole |= verdict_document(result)
     whole["facts"] = facts_document(result.all_facts)
     whole["band_means"] = _band_means(result)
     if noise_parameters is not None:
@@ -251,10 +251,12 @@ def _band_means(result: Result) -> list[BandMeanDocument]:
     return documents
 
 
-def verdict_document(found: TestVerdict | None) -> VerdictDocument:
+def verdict_document(result: Result) -> VerdictDocument:
     """Return the verdict on the limits of the bench file; null where it has none."""
-    if found is None:
+    found, decision = result.verdict, Decision.of(result)
+    if found is None or decision is None:
         return {
+            "decision": None,
             "verdict": None,
             "obstacles": [],
             "sensitivities": [],
@@ -263,6 +265,12 @@ def verdict_document(found: TestVerdict | None) -> VerdictDocument:
         }
     prediction = found.prediction if found.verdict == "not-decided" else None
     return {
+        "decision": {
+            "state": decision.state,
+            "reason": decision.reason,
+            "next_step": decision.next_step,
+            "remarks": decision.remarks,
+        },
         "verdict": found.verdict,
         "obstacles": list(found.obstacles),
         "sensitivities": [

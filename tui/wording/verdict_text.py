@@ -9,17 +9,18 @@ from daq.results.decision.end import Goal, Remaining
 from daq.results.decision.facts import LimitUndecided, WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict, facts_of_verdict
 from estimator.checks.advice import Rank
-from estimator.decision.verdict import REMOVED_BY_TIME, Verdict
+from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
 from estimator.records import dataclass
-from estimator.wording import listed, percent, roughly, several, signed
+from estimator.wording import few, percent, roughly, several, signed
 from tui.page.table import Cell, Tone
-from tui.wording.facts import NOTHING_TO_DO
+from tui.wording.facts import NOTHING_TO_DO, brief, why_no_estimate
 from tui.wording.formatting import level
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from datetime import datetime
 
+    from daq.results.facts.fact import Fact
     from daq.results.result import Result
 
 WORDS: Mapping[Verdict, str] = {
@@ -38,7 +39,6 @@ TONES: Mapping[Verdict, Tone] = {
     Verdict.NOT_DECIDED: "doubtful",
 }
 MARKS: Mapping[Verdict, str] = {Verdict.PASS: "✓", Verdict.FAIL: "✗", Verdict.NOT_DECIDED: "?"}
-SEE_FACTS = "The facts below need action."
 REPAIR = "Repair or replace these sensors, or correct the limit."
 """After a limit that is not met."""
 TOO_EARLY: Mapping[Goal, str] = {
@@ -46,6 +46,10 @@ TOO_EARLY: Mapping[Goal, str] = {
     Goal.PRECISION: "too early for the precision that is wanted",
 }
 """What a planned end is."""
+BY_A_FACT = frozenset({Obstacle.NO_ESTIMATE, Obstacle.NO_SHARED_MOTION, Obstacle.MODEL_MISFIT})
+"""Obstacles that a fact explains, with what to do."""
+TWO_LINES = 145
+"""Characters that fit into two lines of 80, wherever the first breaks."""
 _NEXT_DAYS = 12 * 3600.0
 """Seconds from which the day of a moment is named."""
 
@@ -58,36 +62,69 @@ class Decision:
     ----------
     state : Verdict
     reason, next_step : str
-        In sentences; every state has a next step.
+        In sentences, together two lines of 80 columns; every state has a next step.
     remarks : tuple of str
         What else keeps the test from a decision, and where limits are not judged, a line each.
+    fact : Fact or None
+        Of the result, the one that `next_step` states; None if that is no fact of these.
     """
 
     state: Verdict
     reason: str
     next_step: str
-    remarks: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
+    fact: Fact | None = None
 
     def __str__(self) -> str:
         return f"{self.reason} {self.next_step}"
 
     @classmethod
     def of(cls, result: Result) -> Decision | None:
-        """Return the decision on limits: the next step is the one that decides; None without."""
+        """Return the decision on limits; None without.
+
+        The next step is the one that decides, or else that of the weightiest fact.
+        """
         found = result.verdict
         if found is None:
             return None
         steps = what_to_do(found)
         if record_for(found):  # by time alone: nothing else is missing
             steps = [steps[-1], *steps[:-1]]
-        needed = {each.rank for each in result.facts if each.needs_action}
-        usual = SEE_FACTS
-        if found.verdict is Verdict.PASS and not needed:
-            usual = NOTHING_TO_DO
-        elif found.verdict is Verdict.FAIL and Rank.INVALIDATES not in needed:
-            usual = REPAIR
-        remarks = (*steps[1:], *not_judged(found))
-        return cls(found.verdict, headline(found), steps[0] if steps else usual, remarks)
+        fact = next((each for each in result.facts if each.needs_action), None)
+        if fact is not None and _is_next(fact, found):
+            steps = [f"{fact.words.line}.", *steps]
+        else:
+            fact = None
+        next_step, *others = steps or [_usual_step(result, found.verdict)]
+        reason = headline(found, TWO_LINES - len(next_step))
+        return cls(found.verdict, reason, next_step, (*others, *not_judged(found)), fact)
+
+
+def _is_next(fact: Fact, found: TestVerdict) -> bool:
+    """Return whether a fact comes before all else that a verdict needs."""
+    if found.sensitivities or record_for(found):
+        return False
+    if found.verdict is Verdict.NOT_DECIDED:
+        return BY_A_FACT.issuperset(found.obstacles[:1])
+    return found.verdict is Verdict.PASS or fact.rank is Rank.INVALIDATES
+
+
+def _usual_step(result: Result, verdict: Verdict) -> str:
+    """Return the next step where neither verdict nor facts have one."""
+    usual = {Verdict.PASS: NOTHING_TO_DO, Verdict.FAIL: REPAIR}
+    return usual.get(verdict) or why_no_estimate(result) or "Check the channels without a result."
+
+
+def facts_below(result: Result, more: str = "--details shows all") -> list[str]:
+    """Return the facts below a table in three lines at most; not the one of the first line.
+
+    `more` says how to see all.
+    """
+    decision = Decision.of(result)
+    if decision is None:
+        return brief(result.facts, more)
+    facts = [each for each in result.facts if each is not decision.fact]
+    return brief(facts, more, is_open=decision.next_step != NOTHING_TO_DO)
 
 
 def in_tone(text: str, found: TestVerdict, *, grows: bool) -> Cell:
@@ -96,40 +133,29 @@ def in_tone(text: str, found: TestVerdict, *, grows: bool) -> Cell:
     return Cell(text, "quiet") if is_young else Cell(text, TONES[found.verdict], strong=True)
 
 
-def headline(found: TestVerdict) -> str:
-    """Return the verdict in a sentence or two."""
-    if not any(each.method == "multi-part" for each in found.limits):
-        return _headline(found)
-    who = "Two sensors" if len({each.sensor for each in found.limits}) < 3 else "multi-part"
-    return f"{_headline(found)} {who}: steady gains are assumed."
-
-
-def _headline(found: TestVerdict) -> str:
+def headline(found: TestVerdict, room: int = TWO_LINES) -> str:
+    """Return the verdict in a sentence or two, with the channels that fit into `room`."""
     word = WORDS[found.verdict]
     n_channels = len({each.name for each in found.limits})
-    names = listed(list(dict.fromkeys(each.limit for each in found.limits)) or ["the limits"])
+    names = few(list(dict.fromkeys(each.limit for each in found.limits)) or ["the limits"])
+    if any(each.method == "multi-part" for each in found.limits):
+        names += ", if gains are steady"
     undecided = _channels(found.having(Verdict.NOT_DECIDED))
     if found.verdict is Verdict.PASS:
         who = "the channel is" if n_channels == 1 else f"all {n_channels} channels are"
         return f"{word}: {who} below {names}."
     if found.verdict is Verdict.NOT_DECIDED:
         if found.limits and not undecided and not found.obstacles:
-            have = (
-                "channel that has a result is" if n_channels == 1 else "channels with a result are"
-            )
-            return f"{word}: the {n_channels} {have} below {names}, and the others have none."
-        if not undecided:
-            return f"{word}: whether the channels are below {names} cannot be said."
+            who = several(n_channels, "channel is", "channels are")
+            return f"{word}: {who} below {names}, the others have no result."
         who = f"{len(undecided)} of {several(n_channels, 'channel')}"
-        are = "is" if len(undecided) == 1 else "are"
-        return f"{word}: whether {who} {are} below {names} cannot be said yet."
+        return f"{word}: {who if undecided else 'the channels'} may be above {names}."
     failing = _channels(found.having(Verdict.FAIL))
-    text = (
-        f"{word}: {len(failing)} of {several(n_channels, 'channel')} above {names}: "
-        f"{', '.join(failing)}."
-    )
+    text = f"{word}: {len(failing)} of {several(n_channels, 'channel')} above {names}"
     left = [name for name in undecided if name not in failing]
-    return text + (f" {several(len(left), 'channel')} not decided." if left else "")
+    more = f". {several(len(left), 'channel')} not decided." if left else "."
+    room -= len(f"{text}:  and {len(failing)} more{more}")
+    return text + (f": {few(failing, room=room)}" if room > len(failing[0]) else "") + more
 
 
 def what_to_do(found: TestVerdict) -> list[str]:
@@ -137,7 +163,7 @@ def what_to_do(found: TestVerdict) -> list[str]:
 
     Where it is decided, only sensitivities that are wrong.
     """
-    lines = [str(each) for each in facts_of_verdict(found) if each.needs_action]
+    lines = [f"{each.words.line}." for each in facts_of_verdict(found) if each.needs_action]
     return [line for line in (*lines, record_for(found)) if line]
 
 
@@ -163,10 +189,10 @@ def record_for(found: TestVerdict) -> str:
         return f"Record for {long} in all: that decides{_slowest(found)}."
     left = ""
     if math.isfinite(prediction.resolution_db):
-        left = f", and even {roughly(prediction.longest)} leave ±{prediction.resolution_db:.2g} dB"
+        left = f" (±{prediction.resolution_db:.2g} dB then)"
     return (
-        f"A recording of up to {roughly(prediction.longest)} is not likely to decide: the noise is "
-        f"too close to the limit{left}."
+        f"Even {roughly(prediction.longest)} of recording would hardly decide: the noise is too "
+        f"close to the limit{left}."
     )
 
 

@@ -11,7 +11,7 @@ from daq.results.vocabulary import CAUSES
 from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
 from estimator.records import Hertz, record
-from estimator.wording import Words, listed
+from estimator.wording import Words, few, listed
 
 _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
     Obstacle.SENSORS_LOST: (
@@ -23,28 +23,28 @@ _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
         "Record longer, or choose a shorter segment.",
     ),
     Obstacle.NO_ESTIMATE: (
-        "{channels}: no noise estimate at some frequencies of the limit",
-        "See the advice on what is missing, and record again.",
+        "{channels}: no estimate in a part of the limit",
+        "Follow the advice on what is missing, and record again.",
     ),
     Obstacle.OUTSIDE_SPECTRUM: (
         "The spectrum has no frequency of {limits}",
-        "Choose longer segments or another sampling rate.",
+        "Use longer segments or another sampling rate.",
     ),
     Obstacle.NO_SHARED_MOTION: (
         "A sensor records none of the motion that the others share",
-        "See the advice, and record again.",
+        "Follow the advice, and record again.",
     ),
     Obstacle.FAULTY_CHANNEL: (
-        "{channels}: clipped or temporarily dead, so the noise is lower than estimated",
+        "{channels}: clipped or dead for a while, so the noise is lower",
         "Remove the cause and record again.",
     ),
     Obstacle.MODEL_MISFIT: (
-        "{channels}: the model of one common motion fails, by more than the margin",
+        "{channels}: the model test fails, by more than the margin",
         "Follow the advice and record again.",
     ),
     Obstacle.CLOCKS: (
-        "{channels}: errors of the clocks are too large to decide, or not known",
-        "Give the sensors one clock, or record longer (without --clocks nominal).",
+        "{channels}: errors of clocks are too large or not known",
+        "Use one clock, or record longer (not --clocks nominal).",
     ),
     Obstacle.TOO_FEW_AVERAGES: (
         "The uncertainty of fewer than {averages:g} averages is not reliable",
@@ -86,7 +86,7 @@ class WrongSensitivity(Fact):
         if not self.against:
             text = f"{who} reads {self.gain:.3g} of the other sensors{cause}"
             return Words(
-                f"{text}, and no two of them agree",
+                f"{text}, and no two agree: correct the sensitivities",
                 f"{text}, and no two of them agree.",
                 "Correct the sensitivities, or give their certificates.",
             )
@@ -106,11 +106,12 @@ class LimitUndecided(Fact):
     def _words(self) -> Words:
         text, do = _OBSTACLES[self.obstacle]
         line = text.format(
-            channels=listed(self.channels) if self.channels else "the channels",
-            limits=listed(self.limits) if self.limits else "the limits",
+            channels=few(self.channels or ["the channels"]),
+            limits=few(self.limits or ["the limits"]),
             averages=MIN_AVERAGES,
         )
-        return Words(line, f"{line[0].upper()}{line[1:]}.", do)
+        step = f": {do[0].lower()}{do[1:-1]}" if do else ""
+        return Words(f"{line}{step}", f"{line[0].upper()}{line[1:]}.", do)
 
 
 @record

@@ -88,7 +88,8 @@ class NoisePartShared(Fact):
             f"Estimate with --shared-noise {':'.join(self.sensors)}, and separate their cables."
         )
         return Words(
-            f"{who} share noise{where}: up to {most}",
+            f"{who} share noise{where}: up to {most}"
+            + ("" if self.is_known else "; separate their cables"),
             f"{who} share up to {most} of their noise{where}: this part does not follow the "
             "motion when it changes.",
             "" if self.is_known else remedy,
@@ -112,7 +113,7 @@ class MethodsDiffer(Fact):
         where = "" if self.band is None else f" at {span(*self.band)}"
         by = f"up to {self.difference:.1f} dB" if math.isfinite(self.difference) else "any amount"
         return Words(
-            f"Parts of the recording contradict {self.method}{where} by {by}",
+            f"Parts of the recording contradict {self.method}{where} by {by}: record again",
             f"{listed(self.channels)}{where}: the noise by {self.method} and by multi-part differ "
             f"by {by}, beyond both intervals: the interval holds both. Noise or gains are not "
             "steady, or sensors share noise.",
@@ -142,11 +143,14 @@ class NoiseNotIdentified(Fact):
         axis = f", least along {self.axis}" if self.axis else ""
         why = _NOT_IDENTIFIED[self.refusal].format(change=self.change, axis=axis)
         where = "" if self.band is None else f" at {span(*self.band)}"
-        few = self.refusal in {Refusal.SHORT, Refusal.STEADY, Refusal.WIDE}
+        is_little = self.refusal in {Refusal.SHORT, Refusal.STEADY, Refusal.WIDE}
         return Words(
-            f"Only upper limits{where}: {why}",
+            f"Only upper limits{where}: "
+            + ("record while the motion changes by 3 dB" if is_little else "add a third sensor"),
             f"{listed(self.channels)}{where}: {why}. The noise is anywhere below the upper limit.",
-            _RECORD_CHANGES if few else "Add a third sensor, which needs no motion that changes.",
+            _RECORD_CHANGES
+            if is_little
+            else "Add a third sensor, which needs no motion that changes.",
         )
 
 

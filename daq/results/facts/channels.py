@@ -14,7 +14,7 @@ from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.levels.bands import third_octaves
 from estimator.records import Hertz, Seconds, record
-from estimator.wording import Words, listed, percent, several
+from estimator.wording import Words, few, listed, percent, several
 
 MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""
@@ -35,9 +35,10 @@ class ChannelsClipped(Fact):
 
     def _words(self) -> Words:
         each = zip(self.channels, self.shares, strict=True)
-        who = ", ".join(f"{name} ({100 * share:.2g} %)" for name, share in each)
+        channels = [f"{name} ({100 * share:.2g} %)" for name, share in each]
+        who = ", ".join(channels)
         return Words(
-            f"{who} clipped, so the noise is too high: use a larger range, or less motion",
+            f"{few(channels)} clipped, so the noise is too high: use a larger range",
             f"Clipped: {who} of the samples are at the largest or smallest count of the range: the "
             "noise of these channels is too high.",
             "Use a larger range, or less motion.",
@@ -59,9 +60,10 @@ class ChannelsWrap(Fact):
 
     def _words(self) -> Words:
         each = zip(self.channels, self.bits, strict=True)
-        who = ", ".join(f"{name} (at {bits} bits)" for name, bits in each)
+        channels = [f"{name} (at {bits} bits)" for name, bits in each]
+        who = ", ".join(channels)
         return Words(
-            f"Counts of {who} wrap, so the noise is too high: use a larger range, or less motion",
+            f"Counts of {few(channels)} wrap, so the noise is too high: use a larger range",
             f"Overflow: the counts of {who} wrap: a value beyond one end of the range continues "
             "at the other end. The noise of these channels is too high.",
             "Use a larger range, or less motion. If the device sends more bits than the bench "
@@ -101,7 +103,7 @@ class CodesMissing(Fact):
         who = ", ".join(each)
         is_faulty = any(self.stuck_bits) or any(self.n_missing)
         return Words(
-            f"Codes never occur: {who}",
+            f"Codes of {few(self.channels)} never occur" + ": check the digitizer" * is_faulty,
             f"Codes never occur: {who}. The resolution is less than the counts suggest.",
             "Check the digitizer." if is_faulty else "",
         )
@@ -128,7 +130,7 @@ class ReadingsRepeat(Fact):
         (sensor,) = self.sensors
         how = f"it refreshes at {self.refresh:.3g} Hz, polled at {self.polled:g} Hz"
         return Words(
-            f"{sensor} repeats its values, so the noise is too high: {how}",
+            f"{sensor} repeats its values, so the noise is too high: poll at {self.refresh:.3g} Hz",
             f"{sensor} repeats its values: {how}. {percent(self.share)} of its rows repeat the row "
             "before, and the noise of its channels is too high.",
             "Set its sampling_rate in the bench file to its refresh rate, or below, or let the "
@@ -151,9 +153,10 @@ class ChannelsStoodStill(Fact):
 
     def _words(self) -> Words:
         each = zip(self.channels, self.constant, strict=True)
-        who = ", ".join(f"{name} (for {seconds:.2g} s)" for name, seconds in each)
+        channels = [f"{name} (for {seconds:.2g} s)" for name, seconds in each]
+        who = ", ".join(channels)
         return Words(
-            f"{who} had a constant count, so the noise is too high: exclude that time (--reject)",
+            f"{few(channels)} had a constant count: noise too high; exclude that time (--reject)",
             f"Temporarily dead: {who} had a constant count. The motion missing there counts as "
             "noise.",
             "Exclude that time (--reject; --start and --end for minutes), and check the cable and "
@@ -175,11 +178,12 @@ class RoundedAlike(Fact):
     share: float
 
     def _words(self) -> Words:
-        text = f"{listed(self.channels)} are rounded to counts alike"
+        alike = "are rounded to counts alike"
         return Words(
-            f"{text}: up to {self.share:.0%} of their noise; use smaller counts",
-            f"{text}. Up to {self.share:.0%} of their noise may be taken for motion, or counted "
-            "more than once; the intervals include it.",
+            f"{few(self.channels)} {alike}: up to {self.share:.0%} of their noise; use smaller "
+            "counts",
+            f"{listed(self.channels)} {alike}. Up to {self.share:.0%} of their noise may be taken "
+            "for motion, or counted more than once; the intervals include it.",
             "Use a smaller range or a higher gain, so that the noise is half a count or more.",
         )
 
@@ -203,14 +207,14 @@ class NotLinear(Fact):
     is_subtracted: bool
 
     def _words(self) -> Words:
-        verb = "is" if len(self.channels) == 1 else "are"
+        verb = "is not linear" if len(self.channels) == 1 else "are not linear"
         most = max(self.shares)
-        text = f"{listed(self.channels)} {verb} not linear"
         done = "subtracted" if self.is_subtracted else "in the intervals"
         return Words(
-            f"{text}: up to {most:.0%} of the noise, {done}; check {listed(self.sensors)}",
-            f"{text}: squares and cubes of the motion are up to {most:.0%} of the noise"
-            f" ({self.evidence:.0f} standard deviations). They are {done}.",
+            f"{few(self.channels)} {verb}: up to {most:.0%} of the noise, {done}; check "
+            f"{listed(self.sensors)}",
+            f"{listed(self.channels)} {verb}: squares and cubes of the motion are up to "
+            f"{most:.0%} of the noise ({self.evidence:.0f} standard deviations). They are {done}.",
             "Check the range and the supply of the sensor, or record with less motion."
             + ("" if self.is_subtracted else " --linearise subtracts them."),
         )

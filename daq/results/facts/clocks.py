@@ -17,7 +17,7 @@ from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.records import Seconds, record
-from estimator.wording import Words, listed, several, signed, time_of_day
+from estimator.wording import Words, few, listed, several, signed, time_of_day
 
 _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
 """Findings that unknown clocks alone can bring about."""
@@ -82,7 +82,10 @@ class StatedTimesDrift(Fact):
         against = f" against those of {self.reference}" if self.reference else ""
         head = f"Stated times drift{against}"
         text = f"{head}, as the motion shows: {by}."
-        line = f"{head}: {by}; check that the clocks are synchronised"
+        line = (
+            f"Stated times of {few(list(drifts))} drift by up to {_us(max(drifts.values()))} rms"
+            f"{against}: check the clocks"
+        )
         if self.corrected:
             who = f"Those of {listed(list(self.corrected))}" if self.uncorrected else "They"
             text += f" {who} were corrected to within about {_us(self.left)}."
@@ -105,7 +108,7 @@ class StatedTimesUnchecked(Fact):
         verb = "states" if len(self.sensors) == 1 else "state"
         text = f"The times that {listed(self.sensors)} {verb} could not be compared with the motion"
         return Words(
-            f"{text}: record longer, or with more motion",
+            f"{text}: record longer",
             f"{text} everywhere: it is too weak, the recording too short, or the sensors differ "
             "in a part of it, as where times step by seconds. If they drift or step, the noise is "
             "wrong by a share of the motion.",
@@ -181,7 +184,7 @@ class ClockNotUnderstood(Fact):
             head = f"{listed(self.sensors)} does not follow the common motion in a part of the"
             head += " recording"
             return Words(
-                f"{head}: its clock is not understood",
+                f"{head}: check its clock and place",
                 f"{head}. Its times are off by more than can be measured, or it measures "
                 "something else there. The intervals include this, and limits are not decided.",
                 "Compare the traces of the sensors before and after that part. Check the clock of "
@@ -191,7 +194,7 @@ class ClockNotUnderstood(Fact):
         whose = f"{listed(self.sensors)} ({signed(self.ppm, '+.0f')} ppm)"
         head = f"The clock of {whose} is not understood"
         return Words(
-            f"{head} (off by {_us(self.error)} rms): check for lost samples, and the rate",
+            f"{head} (off by {_us(self.error)} rms): check for lost samples",
             f"{head}: its samples are off by about {_us(self.error)} rms. The intervals include "
             "this error, and limits are not decided.",
             "Check whether samples are lost or repeated without being counted (buffers, cable, the"
@@ -208,7 +211,8 @@ class RatesNominal(Fact):
     def _words(self) -> Words:
         text = f"The samples of {listed(self.sensors)} are taken to be at their nominal rate"
         return Words(
-            f"{text}; intervals do not include its error",
+            f"The rate of {few(self.sensors)} is taken as nominal, an error not in intervals: omit "
+            "--clocks nominal",
             f"{text}. If it is not exact, the noise is too high or too low; intervals and budgets "
             "do not include this error.",
         )

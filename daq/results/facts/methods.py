@@ -20,7 +20,7 @@ from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.records import record
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
-from estimator.wording import Words, listed
+from estimator.wording import Words, few, listed
 
 WITHOUT_ESTIMATE = (
     Flag.DEAD_CHANNEL
@@ -31,6 +31,15 @@ WITHOUT_ESTIMATE = (
     | Flag.NO_COUNTERPART
 )
 """Flags of frequencies that have no estimate."""
+
+
+_REMEDIES = {
+    Flag.DEAD_CHANNEL: "check cable and power",
+    Flag.DUPLICATE: "check ports and bench file",
+    Flag.SINGULAR: "record with more motion",
+    Flag.NO_COUNTERPART: "use --method maximum-likelihood",
+    Flag.NOT_CONVERGED: "record longer",
+}
 
 
 _NO_FLAG = Flag(0)
@@ -78,7 +87,9 @@ class WithoutEstimate(Fact):
         whole = self.most == self.n_frequencies
         at = "all frequencies" if whole else f"{self.most} of {self.n_frequencies} frequencies"
         text = f"{self.method}: {who}: {words.long}, at {at}"
-        return Words(text, text)
+        line = f"{self.method}: {few(self.channels)}: {words.short}, at {at}"
+        do = _REMEDIES.get(self.flag, "check the recording")
+        return Words(f"{line}: {do}", f"{text}.", f"{do[0].upper()}{do[1:]}.")
 
 
 @record

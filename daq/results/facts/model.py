@@ -15,7 +15,7 @@ from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_signals import NoSharedMotion, NoSignal, TooFewSensors
 from estimator.likelihood.dimension import BandDimension
 from estimator.records import Hertz, Share, record
-from estimator.wording import Words, listed, percent, span
+from estimator.wording import Words, few, listed, percent, span
 
 _WHY_UNTESTED = {
     Untested.UNFINISHED: "The diagnosis follows with the first segments.",
@@ -46,7 +46,7 @@ class FewSensors(Fact):
 
     def _words(self) -> Words:
         return Words(
-            "Noise needs more sensors: the table shows the PSD of what the sensor recorded",
+            "The table shows the PSD of what the sensor recorded: place two more beside it",
             "One sensor alone cannot tell its noise from motion: its noise is below its PSD.",
             "Place two more sensors beside it; one more suffices where the motion changes.",
         )
@@ -76,7 +76,8 @@ class ModelUntested(Fact):
             n=self.n_effective, channels=self.n_channels, model=model(self.n_factors, self.dims)
         )
         do = "Record longer." if self.why is Untested.TOO_FEW_AVERAGES else ""
-        return Words(text.rstrip("."), text, do)
+        line = text.rstrip(".") + (": record longer" if do else "")
+        return Words(line, text, do)
 
 
 @record
@@ -144,7 +145,7 @@ class DimensionsUnexplained(Fact):
         head += " averages"
         text = f"{head}: the noise estimate is biased there."
         do = "Put the sensors closer together, or use more sensors."
-        return Words(f"{head}: put the sensors closer together", text, do)
+        return Words(f"{head}: move them closer", text, do)
 
 
 @record
@@ -160,7 +161,7 @@ class DimensionsUndetermined(Fact):
         head = f"At {_bands(self.bands)} Hz the sensors do not share one motion of {self.usual}"
         head += " dimensions"
         return Words(
-            f"{head}: use six sensors, or put them closer together",
+            f"{head}: use six sensors",
             f"{head}. More dimensions explain the averages, but {self.n_sensors} sensors cannot "
             "tell them from noise, which all may share: the estimate may be wrong by any amount.",
             "Use six sensors, or put them closer together.",
@@ -189,8 +190,8 @@ class SharedByTwo(Fact):
         pairs = [" and ".join(pair) for pair in (self.sensors, *self.alternatives)]
         who, at = listed(pairs, "or"), _bands(self.bands)
         return Words(
-            f"{who} share {percent(self.part)} of their noise at {at} Hz, or a motion that only "
-            "they feel",
+            f"{few(pairs, 'or')} share {percent(self.part)} of their noise, or a motion, at {at} "
+            "Hz: check cables and mounts",
             f"At {at} Hz {who} share up to {percent(self.part)} of their noise. No third sensor "
             "feels it, so that it may be noise or motion. The estimate includes it; the intervals "
             "reach down to the noise without it.",

@@ -79,10 +79,11 @@ class BlocksDamaged(Fact):
 
     def _words(self) -> Words:
         text = (
-            f"{listed(self.sensors)}: {several(self.n_blocks, 'block')} of the file damaged (wrong"
-            " checksum) and excluded"
+            f"{listed(self.sensors)}: {several(self.n_blocks, 'block')} of the file damaged and"
+            " excluded"
         )
-        return Words(text, f"{text}.", "huddle repair --check counts all of them.")
+        do = "huddle repair --check counts all of them."
+        return Words(f"{text}: huddle repair --check counts all", f"{text} (wrong checksum).", do)
 
 
 @record
@@ -120,7 +121,7 @@ class SpanShortened(Fact):
         who = f"{listed(self.sensors)} end" if self.at_end else f"{listed(self.sensors)} begin"
         who += "s" * (len(self.sensors) == 1) + (" early" if self.at_end else " late")
         return Words(
-            f"{who}: {clock_time(self.unused)} of the other sensors are not used",
+            f"{who}: {clock_time(self.unused)} of the others are not used; import those alone",
             f"{who}. Only the time of all sensors is estimated: {clock_time(self.unused)} of the"
             " others are not used.",
             "If the others are enough, import them alone: they are estimated over all of their "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from textwrap import wrap
 
 import pytest
 
@@ -11,16 +12,17 @@ from daq.results.decision.end import Goal, Remaining
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
-from estimator.decision.verdict import Verdict
+from estimator.decision.verdict import Obstacle, Verdict
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
+from tests.tui.wording.fact_examples import EXAMPLES
 from tui.application.test_view.panels import advice, findings, known_to
 from tui.application.test_view.plotted import Choice
 from tui.commands.estimate import show_result
 from tui.notebook import text
 from tui.report.noise import verdict
 from tui.wording.facts import NOTHING_TO_DO, brief
-from tui.wording.verdict_text import REPAIR, Decision, how_long, in_tone
+from tui.wording.verdict_text import REPAIR, Decision, facts_below, how_long, in_tone
 
 ALONE = ModelMisfit(
     rank=Rank.INVALIDATES, sensors=(), band=(0.5, 8.3), statistic=30.0, n_factors=3,
@@ -145,5 +147,30 @@ def test_a_test_that_lacks_a_sensor_is_not_decided_for_that_reason() -> None:
     assert found is not None
     assert found.state is Verdict.NOT_DECIDED
     assert found.reason == (
-        "NOT DECIDED: the 9 channels with a result are below data sheet, and the others have none."
+        "NOT DECIDED: 9 channels are below data sheet, the others have no result."
     )
+
+
+@pytest.mark.parametrize("verdict", Verdict)
+def test_the_first_line_names_the_weightiest_fact_and_fits_in_two_lines(verdict: Verdict) -> None:
+    result = Result(misfit(), SETTINGS, bench_with(7e-12))
+    assert result.verdict is not None
+    assert result.verdict.verdict is Verdict.FAIL
+    obstacles = (Obstacle.MODEL_MISFIT,) if verdict is Verdict.NOT_DECIDED else ()
+    result.__dict__["verdict"] = replace(result.verdict, verdict=verdict, obstacles=obstacles)
+    named = []
+    for fact in EXAMPLES:
+        result.__dict__["facts"] = (fact,)
+        decision = Decision.of(result)
+        assert decision is not None
+        assert len(wrap(str(decision), 80)) <= 2, str(decision)
+        if decision.fact is fact:
+            assert decision.next_step == f"{fact.words.line}."
+            named.append(fact)
+        assert len([line for line in facts_below(result) if fact.words.line in line]) == (
+            fact.needs_action and decision.fact is not fact
+        )
+    usual = [each for each in EXAMPLES if each.needs_action]
+    if verdict is Verdict.FAIL:
+        usual = [each for each in usual if each.rank is Rank.INVALIDATES]
+    assert named == usual

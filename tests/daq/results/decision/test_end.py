@@ -83,7 +83,7 @@ def test_what_does_not_end_by_recording_longer_says_so() -> None:
     stuck = replace(CLOSE_TO_IT, obstacles=(Obstacle.CLOCKS,), prediction=None)
     found = remaining(NEVER, stuck, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert found.seconds is None
-    assert "errors of the clocks are too large" in how_long(found, None)
+    assert "errors of clocks are too large" in how_long(found, None)
     assert CLOSE_TO_IT.prediction is not None
     too_close = replace(CLOSE_TO_IT, prediction=replace(CLOSE_TO_IT.prediction, seconds=None))
     found = remaining(NEVER, too_close, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
