@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.bench.sensitivity import Sensitivities
 from daq.estimation.settings import DIMENSIONS
-from daq.estimation.snapshot import Snapshot
+from daq.estimation.snapshot import Snapshot, once
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
@@ -58,6 +58,7 @@ NOTHING_USEFUL = 1.0
 """Share of the noise by which a model that fails may be off, from which nothing is known."""
 
 
+@once
 def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     """Return what widens the intervals of a method's noise at every frequency."""
     noise = snapshot.results[method]
@@ -257,7 +258,9 @@ def _widened(snapshot: Snapshot) -> Snapshot:
         low, high = widened(each.low, each.high, parts)
         low, high = by_chance(each.noise_psd, low, high, NORMAL_95 * deviation(parts))
         results[name] = replace(each, low=low, high=high)
-    return replace(snapshot, results=results)
+    found = replace(snapshot, results=results)
+    found.derived.update(snapshot.derived)  # nothing derived here depends on the intervals
+    return found
 
 
 def _averages(snapshot: Snapshot, choice: BandDimension) -> float:
@@ -350,6 +353,7 @@ def _unseen(snapshot: Snapshot, method: str) -> FloatArray:
     return unseen
 
 
+@once
 def shared_parts(snapshot: Snapshot) -> FloatArray:
     """Return how much of its noise each channel shares with another, (n_freqs, n_channels)."""
     frequency = snapshot.frequency
@@ -368,6 +372,7 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
     return parts
 
 
+@once
 def may_share(snapshot: Snapshot) -> tuple[BoolArray, BoolArray]:
     """Return where all sensors may share noise, and where two of three may, (n_freqs,) each.
 

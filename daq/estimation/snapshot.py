@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,8 @@ from estimator.spectra.segment_rejection import Reason
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Parameters = ParamSpec("Parameters")
+Derived = TypeVar("Derived")
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +313,8 @@ class Snapshot:
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     parts: Parts | None = None
     rejected: tuple[RejectedSegment, ...] = ()
+    derived: dict[tuple[str, ...], Any] = field(default_factory=dict, init=False, repr=False)
+    """What `once` has derived of it; a changed copy begins anew."""
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
@@ -367,3 +373,19 @@ class NoResultError(InsufficientDataError):
     def __init__(self, message: str, snapshot: Snapshot) -> None:
         super().__init__(message)
         self.snapshot = snapshot
+
+
+def once(
+    derive: Callable[Concatenate[Snapshot, Parameters], Derived],
+) -> Callable[Concatenate[Snapshot, Parameters], Derived]:
+    """Return a function that derives something of a snapshot, and of names, once for each."""
+
+    @wraps(derive)
+    def kept(snapshot: Snapshot, /, *names: Parameters.args, **none: Parameters.kwargs) -> Derived:
+        key = (derive.__name__, *map(str, names))
+        if key not in snapshot.derived:
+            snapshot.derived[key] = derive(snapshot, *names, **none)
+        found: Derived = snapshot.derived[key]
+        return found
+
+    return kept

@@ -349,6 +349,9 @@ class Estimate:
     snapshot: Snapshot
     settings: Settings
     _spectra: dict[str, Spectrum] = field(default_factory=dict, init=False, repr=False)
+    _levels: dict[tuple[str, tuple[float, float]], Levels] = field(
+        default_factory=dict, init=False, repr=False
+    )
     _means: dict[tuple[str, tuple[float, float], frozenset[Source]], tuple[BandMeans, ...]] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -470,7 +473,10 @@ class Estimate:
 
     def levels(self, method: str, band: tuple[float, float]) -> Levels:
         """Return the noise of every channel by a method in one band: `Spectrum.levels`."""
-        return self.spectrum(method).levels(band_edges(self.snapshot.frequency, band))
+        if (method, band) not in self._levels:
+            edges = band_edges(self.snapshot.frequency, band)
+            self._levels[method, band] = self.spectrum(method).levels(edges)
+        return self._levels[method, band]
 
 
 def data_interval(estimate: Estimate) -> tuple[FloatArray, FloatArray]:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from daq.results.decision.verdict import TestVerdict
     from daq.results.facts.fact import Fact
     from daq.results.sources import Source
+    from daq.results.standing import PairCoherence
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,13 @@ class Result(Estimate):
         """With those of the verdict."""
         found = self.verdict
         return ranked([*self.facts, *(() if found is None else facts_of_verdict(found))], self)
+
+    @cached_property
+    def coherence(self) -> PairCoherence | None:
+        """Coherence of all pairs of sensors: `pair_coherence`."""
+        from daq.results.standing import pair_coherence  # noqa: PLC0415 - few ask for it
+
+        return pair_coherence(self)
 
     @cached_property
     def clock_effects(self) -> dict[str, float]:

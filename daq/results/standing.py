@@ -10,7 +10,7 @@ import numpy as np
 from daq.bench.channel import Channel
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.snapshot import Snapshot
-from daq.results.result import Result
+from daq.results.band_summary import Estimate
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import EstimatorError
 from estimator.levels.bands import log_edges
@@ -142,9 +142,9 @@ class PairCoherence:
     matrix: FloatArray
 
 
-def pair_coherence(result: Result) -> PairCoherence | None:
+def pair_coherence(estimate: Estimate) -> PairCoherence | None:
     """Return the coherence of all pairs; None without two sensors or averages of them."""
-    snapshot, dims = result.snapshot, result.snapshot.dims
+    snapshot, dims = estimate.snapshot, estimate.snapshot.dims
     frequency = snapshot.frequency
     if len(dims) < 2 or frequency.size < 4:
         return None
@@ -160,7 +160,7 @@ def pair_coherence(result: Result) -> PairCoherence | None:
         return None
     coherence = CanonicalCoherence(checked.matrix, checked.valid)
     chosen &= coherence.usable
-    low, high = result.band
+    low, high = estimate.band
     inside = (frequency >= low) & (frequency <= high) & chosen
     pairs = tuple(combinations(range(len(dims)), 2))
     n_points, matrix = edges.size - 1, np.eye(len(dims))

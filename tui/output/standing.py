@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.text import Text
 
-from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
+from daq.results.standing import PairCoherence, Stance, stances
 from estimator.records import dataclass
 from estimator.wording import listed, signed
 from tui.page.table import Cell, Table
@@ -34,11 +34,8 @@ _SMALL = 0.35
 
 def standing(result: Result, *, width: int) -> list[RenderableType]:
     """Return sketches of all axes and the coherence of all pairs; empty where none is known."""
-    found, coherence, means = (
-        stances(result.snapshot),
-        pair_coherence(result),
-        coherence_table(result),
-    )
+    found, coherence = stances(result.snapshot), result.coherence
+    means = coherence_table(result)
     parts: list[RenderableType] = []
     if found:
         parts.append(Text("Axes of the sensors, seen from above", "bold"))
@@ -119,7 +116,7 @@ def arrows(stance: Stance) -> list[Arrow]:
 
 def coherence_table(result: Result) -> Table | None:
     """Return the mean coherence of all pairs over the band; None where none is known."""
-    found, names = pair_coherence(result), result.snapshot.sensor_names
+    found, names = result.coherence, result.snapshot.sensor_names
     if found is None:
         return None
     rows = (

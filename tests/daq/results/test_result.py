@@ -6,7 +6,8 @@ from collections import Counter
 
 import pytest
 
-from daq.results import band_summary, result
+from daq.estimation import contributions
+from daq.results import band_summary, result, standing
 from daq.results.decision import limits
 from daq.results.result import Result
 from tests.daq.results.decision.benches import bench_with
@@ -23,6 +24,8 @@ ONCE = (
     (band_summary, "judged_method"),
     (band_summary, "data_means"),
     (band_summary, "without_partners"),
+    (contributions, "_unexplained"),  # of `may_share`
+    (standing, "coherency"),  # of `pair_coherence`
 )
 
 
@@ -38,16 +41,16 @@ def test_an_estimate_derives_each_quantity_once(monkeypatch: pytest.MonkeyPatch)
 
         monkeypatch.setattr(module, name, count)
 
-    for module, name in (*ONCE, (band_summary, "contributions"), (band_summary, "shared_parts")):
+    for module, name in (*ONCE, (contributions, "_dimensions")):
         counted(module, name)
-    found = Result(diagnosed(), SETTINGS, bench_with(1e-9))
+    found = Result(contributions.with_contributions(diagnosed()), SETTINGS, bench_with(1e-9))
     for _ in range(2):
         show_result(found, json=None, csv=None, diagnostics=True)
         document(found)
     methods = len(found.snapshot.results)
     assert methods > 1
     once = {name for _, name in ONCE} - {"effect_by_sensor"}  # nothing here shows the clocks
-    assert counts == dict.fromkeys(once, 1) | {"contributions": methods, "shared_parts": methods}
+    assert counts == dict.fromkeys(once, 1) | {"_dimensions": methods}  # of `contributions`
 
 
 def test_means_of_a_band_are_made_once() -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from daq.results.standing import PairCoherence, Stance, pair_coherence, stances
+from daq.results.standing import PairCoherence, Stance, stances
 from tui.output.standing import arrows, caption, remark
 from tui.page import drawing
 from tui.page.blocks import Plot
@@ -30,7 +30,7 @@ _LEAST_LOSS = 1e-5
 
 def standing_plots(result: Result) -> list[Plot]:
     """Return sketches of the axes, the coherence against frequency, and its matrix."""
-    found, coherence = stances(result.snapshot), pair_coherence(result)
+    found, coherence = stances(result.snapshot), result.coherence
     plots = []
     for first in range(0, len(found), COLUMNS):
         some = found[first : first + COLUMNS]
