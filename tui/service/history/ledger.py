@@ -41,20 +41,19 @@ OCTAVES = tuple((2.0**k, 2.0 ** (k + 1)) for k in range(-4, 9))
 OFF = "off"
 _TABLES = """
 CREATE TABLE IF NOT EXISTS tests (
-    run_id TEXT PRIMARY KEY, recording TEXT, bench TEXT, started REAL, simulated INTEGER);
+    run_id TEXT PRIMARY KEY, recording TEXT, bench TEXT, started REAL, caveats TEXT);
 CREATE TABLE IF NOT EXISTS sensors (
     run_id TEXT, serial_number TEXT, sensor TEXT, model TEXT, temperature REAL,
     sensitivities TEXT, limits TEXT, firmware TEXT, PRIMARY KEY (serial_number, run_id));
 CREATE TABLE IF NOT EXISTS noise (
-    run_id TEXT, started REAL, simulated INTEGER, sensor TEXT, model TEXT, serial_number TEXT,
+    run_id TEXT, started REAL, caveats TEXT, sensor TEXT, model TEXT, serial_number TEXT,
     channel TEXT, unit TEXT, method TEXT, low_hz REAL, high_hz REAL, psd REAL, low REAL, high REAL);
 CREATE INDEX IF NOT EXISTS noise_of ON noise (serial_number, started);
 """
 _NOISE = "sensor, model, serial_number, channel, unit, method, low_hz, high_hz, psd, low, high"
 _ADD_NOISE = "INSERT INTO noise VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _LIKE = (
-    "serial_number = ? AND started <= ? AND simulated = ? AND 0 < low AND low <= psd"
-    " AND psd <= high"
+    "serial_number = ? AND started <= ? AND caveats = ? AND 0 < low AND low <= psd AND psd <= high"
 )
 _GROUPS = (
     "SELECT unit, method, low_hz, high_hz, COUNT(DISTINCT run_id) AS n, MIN(started) AS since"  # noqa: S608 - our own words
@@ -66,13 +65,13 @@ _ENDS = (
     " AND method = ? AND low_hz = ? AND high_hz = ? AND started IN (?, ?) ORDER BY started"
 )
 _OF_SENSOR = (
-    f"SELECT bench, noise.started, noise.simulated, {_NOISE} FROM noise JOIN tests"  # noqa: S608
+    f"SELECT bench, noise.started, noise.{{caveats}}, {_NOISE} FROM noise JOIN tests"  # noqa: S608
     " USING (run_id) WHERE serial_number = ? ORDER BY noise.started"
 )
 
 _TESTS = (
     "SELECT started, bench, recording, sensor, model, {firmware}, temperature, sensitivities,"
-    " limits, simulated FROM sensors JOIN tests USING (run_id) WHERE serial_number = ?"
+    " limits, tests.{caveats} FROM sensors JOIN tests USING (run_id) WHERE serial_number = ?"
     " ORDER BY started"
 )
 
@@ -204,27 +203,39 @@ def record_test(path: Path, result: Result) -> list[Drift]:
     about = {name: (each.model, each.serial_number) for name, each in known.items()}
     low, high = known_range(snapshot)[0], float(snapshot.frequency[-2])
     octaves = [each for each in OCTAVES if low <= each[0] and each[1] <= high]
+    caveats = snapshot.caveats.after()
     noise = [
-        (run_id, started, bool(snapshot.caveats), *_values(each))
+        (run_id, started, caveats, *_values(each))
         for each in band_noise(result, octaves, about, [])
         if each.serial_number
     ]
-    test = run_id, path.name, "" if bench is None else bench.name, started, bool(snapshot.caveats)
+    test = run_id, path.name, "" if bench is None else bench.name, started, caveats
     place.parent.mkdir(parents=True, exist_ok=True)
     with closing(sqlite3.connect(place, timeout=10.0)) as ledger:
         ledger.executescript(_TABLES)
-        if "firmware" not in _columns(ledger):  # of an earlier version
-            ledger.execute("ALTER TABLE sensors ADD COLUMN firmware TEXT")
         with ledger:  # all of a test, or nothing
+            ledger.execute("BEGIN IMMEDIATE")
+            _bring_up_to_date(ledger)
             added = ledger.execute("INSERT OR IGNORE INTO tests VALUES (?, ?, ?, ?, ?)", test)
             if added.rowcount:
                 ledger.executemany("INSERT INTO sensors VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 ledger.executemany(_ADD_NOISE, noise)
         found = [
-            _drift(ledger, name, (serial, started, bool(snapshot.caveats)))
-            for name, (_, serial) in about.items()
+            _drift(ledger, name, (serial, started, caveats)) for name, (_, serial) in about.items()
         ]
     return [each for each in found if each is not None]
+
+
+def _bring_up_to_date(ledger: sqlite3.Connection) -> None:
+    """Give the tables of earlier versions the columns that they had not."""
+    if "firmware" not in _columns(ledger, "sensors"):
+        ledger.execute("ALTER TABLE sensors ADD COLUMN firmware TEXT")
+    for table in ("tests", "noise"):
+        if "simulated" in _columns(ledger, table):  # 0 or 1
+            ledger.execute(f"ALTER TABLE {table} RENAME COLUMN simulated TO caveats")
+            ledger.execute(
+                f"UPDATE {table} SET caveats = CASE caveats WHEN 0 THEN '' ELSE 'simulated' END"  # noqa: S608
+            )
 
 
 def _sensor_row(run_id: str, each: SensorRecord, verdict: TestVerdict | None) -> tuple[Any, ...]:
@@ -242,11 +253,11 @@ def _values(noise: RecordedNoise) -> tuple[Any, ...]:
     return tuple(getattr(noise, name) for name in _NOISE.split(", "))
 
 
-def _drift(ledger: sqlite3.Connection, sensor: str, like: tuple[str, float, bool]) -> Drift | None:
+def _drift(ledger: sqlite3.Connection, sensor: str, like: tuple[str, float, str]) -> Drift | None:
     """Return the drift of a sensor in the band with most tests, the widest of these.
 
-    None at its first test. `like` are serial number, time, and whether the test has caveats: tests
-    are compared with their like only.
+    None at its first test. `like` are serial number, time and caveats of the test: tests are
+    compared with their like only.
     """
     serial, started, _ = like
     groups = ledger.execute(_GROUPS, (*like, started)).fetchone()
@@ -277,13 +288,15 @@ def _rows(question: str, serial_number: str) -> list[Any]:
     if place is None or not place.exists():
         return []
     with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
-        firmware = "firmware" if "firmware" in _columns(ledger) else "NULL"
-        return ledger.execute(question.format(firmware=firmware), (serial_number,)).fetchall()
+        firmware = "firmware" if "firmware" in _columns(ledger, "sensors") else "NULL"
+        caveats = "caveats" if "caveats" in _columns(ledger, "tests") else "simulated"
+        question = question.format(firmware=firmware, caveats=caveats)
+        return ledger.execute(question, (serial_number,)).fetchall()
 
 
-def _columns(ledger: sqlite3.Connection) -> list[str]:
-    """Return the columns of the table of sensors, which earlier versions had fewer of."""
-    return [row[1] for row in ledger.execute("PRAGMA table_info(sensors)")]
+def _columns(ledger: sqlite3.Connection, table: str) -> list[str]:
+    """Return the columns of a table, of which earlier versions had others."""
+    return [row[1] for row in ledger.execute(f"PRAGMA table_info({table})")]
 
 
 def sensor_tests(serial_number: str) -> list[SensorTest]:
@@ -311,8 +324,11 @@ def sensor_tests(serial_number: str) -> list[SensorTest]:
     return [each for each in found if bool(each.caveats) is all_have]
 
 
-def _caveats(is_simulated: object) -> Caveats:
-    return Caveats.of({Caveat.SIMULATED: is_simulated})
+def _caveats(names: str | int) -> Caveats:
+    """Return caveats by their names; 0 or 1 are of ledgers that named none but simulation."""
+    if isinstance(names, int):
+        return Caveats.of({Caveat.SIMULATED: names})
+    return Caveats.of(dict.fromkeys(names.split(", "), True))
 
 
 def noise_of(serial_number: str) -> list[Found]:
