@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.events import MouseDown, MouseMove, MouseScrollDown, MouseScrollUp, MouseUp, Resize
 
+    from daq.estimation.settings import Settings
     from daq.estimation.snapshot import Snapshot
     from tui.application.signal_view.source import SignalSource
 
@@ -125,6 +126,7 @@ class SignalView(View):
         self._marks: tuple[float, ...] = ()
         self._key: object = None
         self._created: datetime | None = None
+        self._settings: Settings | None = None  # of the last result, also while the next is made
         self._note = ""
         self._is_busy = self._is_old = False
         self._dragged: tuple[int, tuple[float, float]] | None = None
@@ -156,7 +158,7 @@ class SignalView(View):
         """Draw the state; what takes time is made in a thread."""
         if self.state.path != self._path:
             self._path, self._look, self._drawn, self._key = self.state.path, Look(), None, None
-            self._note = "reading …"
+            self._note, self._settings = "reading …", None
         self._take_excluded()
         self._write()
         self._ask()
@@ -165,6 +167,8 @@ class SignalView(View):
         """Show what the result that is known excludes."""
         if self.state.result is None or self._created is None:
             return
+        if self.state.has_result:
+            self._settings = self.state.result.settings
         found = (stretch(each, self._created) for each in self.state.result.settings.exclude)
         excluded = tuple((begin.timestamp(), end.timestamp()) for begin, end in found)
         self._look = replace(self._look, excluded=excluded)
@@ -260,7 +264,7 @@ class SignalView(View):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
         del parameters
-        known = self.state.has_result if action == "exclude" else True
+        known = self._settings is not None if action == "exclude" else True
         return action not in ACTIONS or (known and self._drawn is not None)
 
     def _change(self, **changes: object) -> None:
@@ -307,8 +311,8 @@ class SignalView(View):
 
     def action_exclude(self) -> None:
         """Begin a stretch at the cursor, exclude what lies between, or take a stretch back."""
-        path, result, look = self.state.path, self.state.result, self._look
-        if path is None or result is None:
+        path, settings, look = self.state.path, self._settings, self._look
+        if path is None or settings is None:
             return
         if look.cursor is None:
             self.action_cursor(0.0)
@@ -326,7 +330,7 @@ class SignalView(View):
             chosen = (*look.excluded, (ends[0], ends[1]))
         self._change(excluded=chosen, begun=None)
         exclude = tuple(stretch_text(*each) for each in chosen)
-        changes = as_changes(result.settings) | {"exclude": exclude}
+        changes = as_changes(settings) | {"exclude": exclude}
         self.post_message(OpeningRequested(path, changes, SIGNAL))
 
     def action_mark(self, step: int = 1) -> None:
