@@ -6,8 +6,8 @@ A recording is never changed in place. A copy in the same folder is changed, fsy
 the original, so that the name always refers to an intact file.
 
 ``python -m daq.recording.repair TASK FILE…`` is the child of :mod:`daq.recording.storage.trial`.
-Its task is ``open`` or ``verify``. For each file it prints a line of JSON; before it, a line with a
-point for each part that was read. It may hang or be killed at any file.
+Its task is ``open``, ``verify`` or ``close``. For each file it prints a line of JSON; before it, a
+line with a point for each part that was read. It may hang or be killed at any file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.errors import HuddleError, RecordingError
+from daq.errors import HuddleError, NotARecordingError, RecordingError
 from daq.host_clock import SystemClock
 from daq.protocols.block import EventKind, HostTime
 from daq.recording import file_format
@@ -49,11 +49,12 @@ from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.refusals import damage_named, text
 from daq.recording.storage.superblock import Superblock
-from daq.recording.storage.trial import remember
+from daq.recording.storage.trial import remember, trials
 from daq.recording.storage.whole_hdf5 import WholeHdf5
 from daq.whole_file import create_private, replaced
 
 _ROWS_PER_READ = 1 << 17
+_CLOSE = "close"
 _SUPERBLOCK = "the superblock: the recorder was killed while it closed the file"
 
 
@@ -173,41 +174,53 @@ def repair(
             f"{path}: another program is writing it or has it open; stop that program first"
         )
     journal = _own_journal(path)
+    now = SystemClock().now() if now is None else now
     if journal is None:
-        report = verify(path, progress=progress)
-        if not _is_left_open(path, report):
-            _remove_useless_journal(path)
-            return report
+        if not Superblock.of(path).is_open:
+            report = verify(path, progress=progress)
+            if report.closed:
+                _remove_useless_journal(path)
+                return report
+        with _replaced(path) as copy:
+            _close_in_child(path, copy, now)
     elif (whole := _whole(path, journal, progress)) is not None:
         journal_path(path).unlink()
         return whole
-    now = SystemClock().now() if now is None else now
-    with _replaced(path, copied=journal is None) as copy:
-        if journal is None:
-            with copy.open("r+b") as raw:
-                raw.write(Superblock.of(path).cleared())
-        else:
+    else:
+        with _replaced(path, copied=False) as copy:
             rebuild(path, journal, copy)
-            report = verify(copy, progress=progress)
-        with WholeHdf5(copy, libver=LIBVER) as hdf5:
-            if not report.closed:
-                _cut_to_committed(hdf5.file, report)
-                _add_last_events(hdf5.file, report, now)
-            write_checksums(hdf5.file)
-            write_manifest(hdf5.file)
-            if RESULTS in hdf5.file:
-                write_manifest(hdf5.file, RESULTS_MANIFEST)
-        _check_repaired(path, verify(copy, progress=progress), report)
-    if journal is not None:
+            _close(copy, verify(copy, progress=progress), now, progress)
         journal_path(path).unlink(missing_ok=True)
     _remove_useless_journal(path)
     return verify(path, progress=progress)
 
 
-def _check_repaired(path: Path, found: Verification, report: Verification) -> None:
-    """Refuse a copy that has other rows than what was saved from the recording."""
+def _close_in_child(path: Path, copy: Path, now: HostTime) -> None:
+    """Close the copy of a recording without a journal: HDF5 may crash in what a power cut tore."""
+    for task in ("open", f"{_CLOSE}:{now.monotonic_ns}:{now.utc_ns}"):
+        [(_, found)] = trials([copy], task)
+        if reason := found.get("fatal") or found.get("error"):
+            reason = reason.removeprefix(f"{copy}: ").removeprefix("the recording is ")
+            reason = f"damaged: {reason.removeprefix('damaged: ')}"
+            raise NotARecordingError(
+                f"{path}: {reason}. It was not changed. Put {journal_path(path).name} beside it "
+                "and repair it again, or restore a copy of both"
+            )
+
+
+def _close(copy: Path, report: Verification, now: HostTime, progress: Callable[[], object]) -> None:
+    """Close a copy with the rows of a report, and refuse it if it then has others."""
+    with WholeHdf5(copy, libver=LIBVER) as hdf5:
+        if not report.closed:
+            _cut_to_committed(hdf5.file, report)
+            _add_last_events(hdf5.file, report, now)
+        write_checksums(hdf5.file)
+        write_manifest(hdf5.file)
+        if RESULTS in hdf5.file:
+            write_manifest(hdf5.file, RESULTS_MANIFEST)
+    found = verify(copy, progress=progress, tried=True)
     if not found.closed or found.changed or found.sensors != _closed(report.sensors):
-        raise RecordingError(f"{path}: the repaired copy differs from what was saved")
+        raise RecordingError(f"{copy}: the repaired copy differs from what was saved")
 
 
 def _closed(sensors: Sequence[SensorVerification]) -> tuple[SensorVerification, ...]:
@@ -378,6 +391,8 @@ def main() -> None:
 def found_in(path: Path, task: str) -> dict[str, Any]:
     """Return what a task finds in a file that may hold this process up."""
     try:
+        if task.startswith(_CLOSE):
+            return _closed_by(path, HostTime(*map(int, task.split(":")[1:])))
         return _opened(path) if task == "open" else _verified(path)
     except (HuddleError, OSError) as error:
         return {"error": str(error)}
@@ -391,6 +406,16 @@ def _opened(path: Path) -> dict[str, Any]:
         for _ in chain(items(file), items(file, RESULTS_MANIFEST)):
             _print_progress()
     return {"opened": True}
+
+
+def _closed_by(path: Path, now: HostTime) -> dict[str, Any]:
+    """Close a recording in its place."""
+    report = verify(path, progress=_print_progress, tried=True)
+    with path.open("r+b") as raw:
+        raw.write(Superblock.of(path).cleared())
+    with damage_named(path):
+        _close(path, report, now, _print_progress)
+    return {"closed": True}
 
 
 def _verified(path: Path) -> dict[str, Any]:

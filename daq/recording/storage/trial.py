@@ -65,7 +65,8 @@ def trials(paths: Sequence[Path], task: str) -> Iterator[tuple[Path, dict[str, A
     ----------
     paths : sequence of Path
     task : str
-        ``open`` or ``verify``.
+        ``open``, ``verify``, or ``close:M:U`` with the host's time in ns, monotonic and UTC. What
+        closes a file writes for an unknown time, and is not ended.
     """
     left = list(paths)
     while left:
@@ -91,9 +92,10 @@ def _trials(paths: Sequence[Path], task: str) -> Iterator[dict[str, Any]]:
     ):
         try:
             ready.register(child.stdout, selectors.EVENT_READ)  # type: ignore[arg-type]  # a pipe
-            wait, buffered, n_found = _START, b"", 0
+            is_limited = task in {"open", "verify"}
+            wait, buffered, n_found = _START if is_limited else None, b"", 0
             while ready.select(wait):
-                wait = LIMIT
+                wait = LIMIT if is_limited else None
                 received = child.stdout.read(1 << 16)  # type: ignore[union-attr]  # a pipe
                 if not received:
                     break

@@ -68,6 +68,21 @@ def test_a_file_that_crashes_the_child_is_damaged(
     assert len(found) == 2
 
 
+def test_a_torn_recording_without_its_journal_that_crashes_hdf5_stays_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "torn.h5"
+    write_recording(path)
+    before = bytearray(path.read_bytes())
+    before[11] = 5  # the superblock's flags of a writer
+    path.write_bytes(before)
+    monkeypatch.setattr(trial, "_CHILD", "no.such.module")
+    with pytest.raises(NotARecordingError, match=r"HDF5 crashes .*Put torn.h5.journal"):
+        repair(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_file_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, copy = tmp_path / "a.h5", tmp_path / "b.h5"
     write_recording(path)

@@ -150,14 +150,14 @@ async def test_a_stretch_is_excluded_and_taken_back(path: Path) -> None:
         await reached(pilot, lambda: app.state.has_result and _n_excluded(app) == 0)
         assert app.state.result is not None
         assert app.state.result.snapshot.n_segments == whole
-        assert not view.look.excluded
+        await reached(pilot, lambda: not view.look.excluded)
         await pilot.press("t", *"01:00:30", "enter", "x", "t", *"01:00:20", "enter", "x")
         await reached(pilot, lambda: _n_excluded(app) > 0)
         app.state = replace(app.state, result=None)  # while an estimate is made
         await pilot.press("x")
-        assert not view.look.excluded
+        await reached(pilot, lambda: not view.look.excluded)
         await reached(pilot, lambda: app.state.has_result and _n_excluded(app) == 0)
-        assert not view.look.excluded
+        await reached(pilot, lambda: not view.look.excluded)
 
 
 def test_the_end_of_an_excluded_stretch_is_in_it() -> None:
