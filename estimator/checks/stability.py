@@ -525,7 +525,10 @@ def _changed(
         if band.levels is None:
             total = total + band.responses
             continue
-        unsteady = band.levels.statistic > critical_value(n_parts - 1, FALSE_ALARM)
+        # both: levels that are hardly known are below zero at times, and have no logarithm
+        linear = (n_parts - 1) * (band.levels.deviation / band.levels.expected) ** 2
+        most = critical_value(n_parts - 1, FALSE_ALARM)
+        unsteady = np.minimum(band.levels.statistic, linear) > most
         level, responses = np.ones(n_parts), band.responses
         if unsteady.any():
             level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))

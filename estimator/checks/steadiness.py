@@ -105,6 +105,27 @@ class Regression:
         found[some] = ((DW - mean @ W) * (D - mean).conj()).sum(axis=(1, 3)).real
         return found
 
+    def beside_fit(self) -> ComplexArray:
+        """Return `along` without what is wrong with the fit, alike in all parts.
+
+        Directions that are off add ``A M_k``, with M_k the motion of a part; noise that is off adds
+        ``B n_k``. A is such that the sum is zero: the fit ends a little beside that, which counts
+        110 dB above the noise. B, of variance c / n by scatter, counts where the motion of some
+        parts is weaker than the noise.
+        """
+        M, (p, q) = self.motion, self.directions.shape[1:]
+        n = self.averages + q
+        total, inverse = n.sum(), np.linalg.inv(M.sum(axis=0))
+        mean = self.along.sum(axis=0) @ inverse
+        apart = np.tensordot(n, self.coefficients, axes=1) - total * mean
+        # P diag(e) U of errors e, of which `inverse` over n is the covariance
+        c = (np.einsum("fii,fii->f", self.inverse, self.projector).real - p) / ((p - q) * q)
+        known = np.tensordot(n**2, np.linalg.inv(M), axes=1) - total**2 * inverse
+        known += (total / np.where(c > 0, c, 1.0))[:, None, None] * np.eye(q)
+        B = apart @ np.linalg.inv(known)
+        A = mean - total * B @ inverse
+        return np.asarray(self.along - n[:, None, None, None] * B - A @ M)
+
 
 def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     """Regress the residuals of every part on its motion.
@@ -222,7 +243,7 @@ class ResponseScores:
         a, b = self._to, self._from
         U, P, s = found.directions, found.projector, found.scale
         ratio = s[:, a] / s[:, b]
-        score = found.along @ U.conj().swapaxes(1, 2)
+        score = found.beside_fit() @ U.conj().swapaxes(1, 2)
         # variance of the score, with neighbours correlated, over the independent one
         more = float(correlation.sum() / len(correlation))
         UU = U @ U.conj().swapaxes(1, 2)

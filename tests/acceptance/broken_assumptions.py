@@ -428,17 +428,8 @@ class Kind:
     names_sensor: bool = True
 
 
-STEADY = (
-    "ResponsesChange",
-    "ResponseChange",
-    "ResponseChanges",
-    "UnsteadyResponse",
-    "UnsteadyResponses",
-    "GainChange",
-    "GainChanges",
-    "Turned",
-)
-NOISE = ("NoiseChanges", "UnsteadyNoise", "NoiseUnsteady", "Unsteady", "ChangingNoise")
+STEADY = ("ResponseChanges",)
+NOISE = ("NoiseChanges",)
 LINEAR = ("NotLinear",)
 KINDS: Mapping[str, Kind] = {
     "nothing": Kind(_nothing),
