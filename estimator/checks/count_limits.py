@@ -230,8 +230,8 @@ def share_at_ends(counts: NDArray[Any], ordered: NDArray[Any] | None = None) -> 
     unit = float(steps[steps > 0].min(initial=math.inf))
     middle = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
     return sum(
-        max(_at_soft_end(side * signal, parts, unit, side * middle) for parts in WIDTHS)
-        for side in (1, -1)
+        max(_at_soft_end(*each, parts, unit, side * middle) for parts in WIDTHS)
+        for side, each in ((1, (signal, ordered)), (-1, (-signal, -ordered[::-1])))
     )
 
 
@@ -249,16 +249,19 @@ def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> b
     return int(times[inner].sum()) >= MIN_ON_SLOPES * n_cut
 
 
-def _at_soft_end(values: FloatArray, parts: int, unit: float, middle: float) -> float:
+def _at_soft_end(
+    values: FloatArray, ordered: FloatArray, parts: int, unit: float, middle: float
+) -> float:
     """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped.
 
-    `unit` is the least distance of two values, `middle` their median.
+    `ordered` are the same values, ascending, `unit` is their least distance, `middle` the median.
     """
-    top = values.max()
-    width = (top - values.min()) / parts
+    top = ordered[-1]
+    width = (top - ordered[0]) / parts
     if width < 2 * unit:
         return 0.0
-    below = np.bincount(np.minimum((top - values) / width, parts - 1).astype(np.int64))
+    near = ordered[np.searchsorted(ordered, top - (max(SLOPES * parts, BESIDE) + 1) * width) :]
+    below = np.bincount(np.minimum((top - near) / width, parts - 1).astype(np.int64))
     n_end, n_near = int(below[0]), int(below[1 : int(SLOPES * parts)].sum())
     few = n_end < max(MIN_REPEATS, float(TIMES * below[1:BESIDE].max(initial=0)))
     if few or n_end > AT_SOFT_END * len(values) or n_near < MIN_ON_SLOPES * n_end:
@@ -336,7 +339,9 @@ def codes(counts: NDArray[Any]) -> Codes | None:
     values, times = _distinct(np.sort(whole, kind="stable"))  # fast where they are sorted
     if len(values) < DISTINCT_CODES:
         return None
-    step = int(np.gcd.reduce(np.diff(values)))
+    steps = np.diff(values)
+    step = int(np.gcd.reduce(steps[:DISTINCT_CODES]))  # mostly 1, by which nothing divides more
+    step = step if step == 1 else int(np.gcd.reduce(steps))
     span = int(values[-1] - values[0]) // step + 1
     stuck = tuple(_stuck_bits(values, times, step))
     n_missing = 0 if stuck else _n_missing((values - values[0]) // step, times)
