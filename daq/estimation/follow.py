@@ -23,7 +23,13 @@ from typing import Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
-from daq.estimation.freed_memory import c_function, give_back
+from daq.estimation.freed_memory import (
+    M_MMAP_THRESHOLD,
+    M_TRIM_THRESHOLD,
+    c_function,
+    give_back,
+    reuse,
+)
 from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
@@ -40,8 +46,8 @@ LARGE = 1 << 21
 """Size in bytes from which an array gets a mapping of its own. Mappings cost system time. Estimate
 of 2 h of three triaxial sensors: 2 s without mappings, 8 s with this limit, 14 s with 128 kB; the
 peaks are 237, 187 and 181 MB. Arrays of a live estimate are smaller."""
-_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of malloc.h
-_HEAPS = 2
+_M_ARENA_MAX, _HEAPS = -8, 2  # of malloc.h
+_RETURNED = 1 << 17
 
 
 class FreedMemory:
@@ -50,8 +56,10 @@ class FreedMemory:
     def __init__(self) -> None:
         self._next = 0.0
         option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
+        reuse()  # not again, by an estimate beside
         if option is not None:
-            option(_M_MMAP_THRESHOLD, LARGE)
+            option(M_MMAP_THRESHOLD, LARGE)
+            option(M_TRIM_THRESHOLD, _RETURNED)
             option(_M_ARENA_MAX, _HEAPS)
 
     def give_back(self) -> None:

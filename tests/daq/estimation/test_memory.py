@@ -47,6 +47,39 @@ def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
     assert float(ended.stdout) < 20.0
 
 
+_ARRAYS_AGAIN = """
+import resource
+import numpy as np
+from daq.estimation.follow import FreedMemory
+from daq.estimation.freed_memory import reuse
+
+def faults() -> int:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        one, other = np.ones(2_000_000), np.ones(1_000_000)
+        del one, other
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+reuse()
+faults()
+print(faults())
+FreedMemory()
+reuse()
+print(faults())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its C library may keep no memory")
+def test_new_arrays_take_the_memory_of_freed_ones_unless_a_recording_is_followed() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", _ARRAYS_AGAIN], capture_output=True, text=True, check=True
+    )
+    again, followed = map(int, ended.stdout.split())
+    pages = 20 * 24_000_000 // 4096
+    assert again < pages / 100
+    assert followed > pages / 20  # some are large ones
+
+
 def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
     rng = np.random.default_rng(0)
     n_segments, n_kept, p = 1000, 48, 9
