@@ -144,7 +144,7 @@ def test_the_reference_of_commands_has_every_command_and_option() -> None:
 
 def test_the_reference_of_facts_has_every_kind_and_number_of_the_json() -> None:
     who = names("A", "B", "C")
-    advice = [Finding(rank=Rank.DELAYS, findings=(each,), names=who) for each, _ in ADVICE]
+    advice = [Finding(rank=Rank.DELAYS, findings=(each,), names=who) for each in ADVICE]
     written = facts_document([*FACTS, *advice])
     for table, found in (
         (facts(), written),

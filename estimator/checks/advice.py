@@ -114,7 +114,7 @@ class Advice(Record):
         words = self._words(names)
         if len(found) == 1:
             return words
-        line = f"{words.line} (and {len(found) - 1} more like this)"
+        line = f"{words.line} (and {len(found) - 1} more)"
         text = self._together(found, names)
         if not text:
             return Words(line, " ".join(str(each.words(names)) for each in found))

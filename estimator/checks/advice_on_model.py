@@ -98,8 +98,8 @@ class ModelMisfit(Advice):
         do = "use --method auto" if room else "move them closer"
         at = f", {self.worst_statistic:.3g} at {span(*self.worst_band)}"
         return Words(
-            f"The sensors do not share one motion at {self.where} (noise may be wrong by "
-            f"{percent(self.error)}): {do}",
+            f"The sensors do not share one motion at {self.where} (noise may be "
+            f"{percent(self.error)} off): {do}",
             f"{_test_fails(self, names)} (test statistic {self.statistic:.3g} "
             f"times its expectation{at if self.worst_band != self.band else ''}"
             f"{'' if self.rank is Rank.INVALIDATES else ': significant, but small'}). "

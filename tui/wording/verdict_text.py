@@ -154,6 +154,7 @@ def headline(found: TestVerdict, room: int = TWO_LINES) -> str:
     text = f"{word}: {len(failing)} of {several(n_channels, 'channel')} above {names}"
     left = [name for name in undecided if name not in failing]
     more = f". {several(len(left), 'channel')} not decided." if left else "."
+    more = more if len(text + more) <= room else "."
     room -= len(f"{text}:  and {len(failing)} more{more}")
     return text + (f": {few(failing, room=room)}" if room > len(failing[0]) else "") + more
 

@@ -319,7 +319,7 @@ def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
         for channel in json.loads(json_file.read_text(encoding="utf-8"))["channels"]
     ]
     reversed_ = f"{label[5]} has the opposite polarity to {label[2]}"
-    assert f"▲ {reversed_}: check the wires (and 1 more like this)" in words
+    assert f"▲ {reversed_}: check the wires (and 1 more)" in words
     long = " ".join(printed("estimate", str(out), "--segment", "1s", "--details").split())
     assert f"{names[0]} → {names[1]}" in long
     assert f"{reversed_}, {label[8]} has the opposite polarity to {label[5]}: no bias" in long

@@ -88,8 +88,14 @@ from estimator.decision.verdict import Obstacle
 from estimator.levels.contributions import Source
 from estimator.self_noise.result import Flag, Refusal
 from estimator.spectra.segment_rejection import Reason
-from tests.tui.wording.advice_examples import MISFIT, names
+from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
+from tests.tui.wording.advice_examples import MISFIT, SEVERAL, names
 
+FINDINGS = tuple(
+    Finding(rank=found[0].rank, findings=found, names=names("a", "b", "c"))
+    for found in (*((each,) for each in ADVICE), *SEVERAL)
+)
+"""All words of the estimator, alone and together."""
 A, NOON = ("A",), 1_700_000_000_000_000_000
 
 EXAMPLES: tuple[Fact, ...] = (

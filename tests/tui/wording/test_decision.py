@@ -15,7 +15,7 @@ from estimator.checks.advice_on_model import ModelMisfit
 from estimator.decision.verdict import Obstacle, Verdict
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
-from tests.tui.wording.fact_examples import EXAMPLES
+from tests.tui.wording.fact_examples import EXAMPLES, FINDINGS
 from tui.application.test_view.panels import advice, findings, known_to
 from tui.application.test_view.plotted import Choice
 from tui.commands.estimate import show_result
@@ -159,7 +159,8 @@ def test_the_first_line_names_the_weightiest_fact_and_fits_in_two_lines(verdict:
     obstacles = (Obstacle.MODEL_MISFIT,) if verdict is Verdict.NOT_DECIDED else ()
     result.__dict__["verdict"] = replace(result.verdict, verdict=verdict, obstacles=obstacles)
     named = []
-    for fact in EXAMPLES:
+    facts = [*EXAMPLES, *FINDINGS]
+    for fact in facts:
         result.__dict__["facts"] = (fact,)
         decision = Decision.of(result)
         assert decision is not None
@@ -170,7 +171,7 @@ def test_the_first_line_names_the_weightiest_fact_and_fits_in_two_lines(verdict:
         assert len([line for line in facts_below(result) if fact.words.line in line]) == (
             fact.needs_action and decision.fact is not fact
         )
-    usual = [each for each in EXAMPLES if each.needs_action]
+    usual = [each for each in facts if each.needs_action]
     if verdict is Verdict.FAIL:
         usual = [each for each in usual if each.rank is Rank.INVALIDATES]
     assert named == usual

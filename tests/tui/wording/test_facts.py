@@ -28,7 +28,7 @@ from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import assert_as_kept, result_of
 from tests.tui.wording.advice_examples import MISFIT
-from tests.tui.wording.fact_examples import EXAMPLES, kinds
+from tests.tui.wording.fact_examples import EXAMPLES, FINDINGS, kinds
 from tui.application.result_view.result_text import result
 from tui.application.state import State
 from tui.application.test_view.panels import findings
@@ -74,7 +74,7 @@ def test_words_are_a_line_and_sentences(fact: Fact) -> None:
 def test_all_words_of_all_kinds_are_as_kept() -> None:
     lines = (
         f"{fact.name}, {fact.rank}: {each}"
-        for fact in EXAMPLES
+        for fact in (*EXAMPLES, *FINDINGS)
         for each in (fact.words.line, fact.words.explanation, fact.words.action)
         if each
     )
