@@ -21,13 +21,19 @@ from daq.devices.guralp import brp, gcf, scream
 from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.devices.labjack import packets
 from daq.devices.labjack.packets import Packet
-from daq.devices.labjack.registers import AduFinder
+from daq.devices.labjack.registers import AduFinder, decode_feedback
 from daq.devices.labjack.stream import StreamDecoder
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import FifoDecoder
 from daq.devices.modbus.registers_protocol import RegisterDecoder, RegisterMap
 from daq.devices.seedlink import packets as seedlink
-from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection, WaveRecord, encode_record
+from daq.devices.seedlink.decoder import (
+    SeedLinkDecoder,
+    StreamSelection,
+    WaveRecord,
+    decode_record,
+    encode_record,
+)
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.protocols.block import Block, Event, HostTime
@@ -165,8 +171,12 @@ def scream_udp(fuzzed: bytes) -> None:
     _demand(found, 0)
 
 
-PACKETS = b"".join(
-    packets.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=k)) for k in range(5)
+PACKETS, LATER_PACKETS = (
+    b"".join(
+        packets.encode_packet(Packet(np.arange(40, dtype=np.uint16), transaction=first + k))
+        for k in range(5)
+    )
+    for first in (0, 30_000)
 )
 
 
@@ -174,6 +184,8 @@ def labjack_stream(fuzzed: bytes) -> None:
     """Spontaneous packets of a LabJack."""
     decoder = StreamDecoder({"A": [0, 2, 4, 6]}, scan_list=[0, 2, 4, 6], scan_rate=1000.0)
     _feed(decoder.receive, fuzzed)
+    # zeros end what looked like a packet begun
+    _demand(decoder.receive(bytes(1100) + LATER_PACKETS + bytes(1100), _at(LATER)), 50)
 
 
 def labjack_registers(fuzzed: bytes) -> None:
@@ -182,8 +194,9 @@ def labjack_registers(fuzzed: bytes) -> None:
     for read, _ in _reads(fuzzed):
         with contextlib.suppress(RemoteProtocolError):
             list(finder.receive(read))
-    with contextlib.suppress(RemoteProtocolError):
-        packets.decode_response(fuzzed)
+    for decode in (packets.decode_response, decode_feedback):
+        with contextlib.suppress(RemoteProtocolError):
+            decode(fuzzed)
 
 
 def fifo(fuzzed: bytes) -> None:
@@ -256,6 +269,12 @@ def _seedlink(version: seedlink.Version, station: str, k: int) -> bytes:
     return seedlink.encode_packet(seedlink.Packet(k + 1, payload, f"XX_{station}"), version)
 
 
+def seedlink_record(fuzzed: bytes) -> None:
+    """One record."""
+    with contextlib.suppress(RemoteProtocolError):
+        decode_record(fuzzed)
+
+
 def _seedlink_target(version: seedlink.Version) -> Callable[[bytes], None]:
     def run(fuzzed: bytes) -> None:
         """Packets of one station; after another connection those of a second one."""
@@ -305,6 +324,7 @@ TARGETS: dict[str, tuple[Callable[[bytes], None], list[bytes]]] = {
         text_datagrams,
         [b"\x13" + b"".join(b"{'EH%c', 10.%d, 1}  " % (c, k) for k in range(3) for c in b"ZNE")],
     ),
+    "seedlink_record": (seedlink_record, [SEEDLINK[3][8:520]]),
     "seedlink_3": (_seedlink_target(3), [b"\xff" + SEEDLINK[3], b"\x28" + SEEDLINK[3][:700]]),
     "seedlink_4": (_seedlink_target(4), [b"\xff" + SEEDLINK[4], b"\x28" + SEEDLINK[4][:700]]),
     "text_packets": (text_packets, [b"\xff{'EHZ', 1582315130.292, 14168, 14927, 7}"]),

@@ -5,8 +5,18 @@ from __future__ import annotations
 import random
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.fuzz.targets import TARGETS
+
+
+@pytest.mark.parametrize("name", TARGETS)
+@settings(max_examples=100, deadline=None)
+@given(fuzzed=st.binary(max_size=1500))
+def test_any_bytes(name: str, fuzzed: bytes) -> None:
+    target, _ = TARGETS[name]
+    target(fuzzed)
 
 
 @pytest.mark.parametrize("name", TARGETS)

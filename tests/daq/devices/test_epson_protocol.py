@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from daq.devices.epson import commands
 from daq.devices.epson.burst import BurstDecoder
-from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Register, Write
+from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Write
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime, Reading
 
 RATE = 200.0
@@ -119,15 +119,6 @@ def test_device_reads_what_the_driver_writes_and_recovers_from_a_stray_delimiter
     assert [c for octet in sent for c in bytewise.receive(bytes([octet]))] == wanted
 
 
-@given(st.binary(max_size=200), st.sampled_from([commands.ID, Register(1, 0x0C)]))
-def test_the_device_accepts_commands_after_any_bytes(garbage: bytes, register: Register) -> None:
-    device = CommandDecoder()
-    device.receive(garbage)
-    device.receive(bytes([commands.DELIMITER]) * 3)
-    heard = device.receive(commands.read(register))
-    assert heard[-1] == Read(register.address)
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.data())
 def test_blocks_do_not_depend_on_the_division_of_bytes(data: st.DataObject) -> None:
@@ -140,18 +131,6 @@ def test_blocks_do_not_depend_on_the_division_of_bytes(data: st.DataObject) -> N
         found += split.receive(stream[start:stop], at(0.2))
     assert samples(found) == samples(decoder().receive(stream, at(0.2)))
     assert set(range(20)) | set(range(22, 40)) <= set(samples(found))
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.binary(max_size=300), max_size=5))
-def test_after_garbage_every_valid_frame_is_decoded(garbage: list[bytes]) -> None:
-    one = decoder()
-    for piece in garbage:
-        one.receive(piece, at(0))
-    # what was garbage may have held a header: its frame cannot reach past one length
-    found = samples(one.receive(bytes(24) + frames(0, 50), at(0.25)))
-    assert len(found) == 50
-    assert [counts[0] for counts in found.values()] == list(range(50))
 
 
 @pytest.mark.parametrize(

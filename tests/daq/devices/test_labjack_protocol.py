@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from daq.devices.labjack import stream
@@ -330,21 +328,6 @@ def test_a_response_that_declares_too_many_samples_is_refused(values: bytes) -> 
 
 
 # --- any bytes -------------------------------------------------------------------------------
-
-
-@settings(max_examples=60)
-@given(st.lists(st.binary(max_size=200), max_size=6), st.booleans())
-def test_stream_decoding_continues_after_any_bytes(pieces: list[bytes], timed: bool) -> None:
-    receiver = decoder(timed=timed)
-    noise = b"".join(pieces)
-    receiver.receive(noise, at(1))
-    rows = scans(0, 100, timed=timed)
-    n_columns = rows.shape[1]
-    found: list[DeviceItem] = []
-    for data in (*packets(rows, 10 * n_columns), bytes(1100)):
-        found += receiver.receive(data, at(2))
-    counts, _, _ = of("A", found)
-    np.testing.assert_array_equal(counts[-100:], rows[:, -4:-1])
 
 
 def test_memory_stays_bounded() -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from daq.devices.labjack import registers
-from daq.devices.labjack.packets import decode_response
 from daq.devices.labjack.registers import Adu, AduFinder, RangeCalibration, ReadAt, WriteAt
 from daq.protocols.errors import RemoteProtocolError
 
@@ -92,13 +89,3 @@ def test_t8_calibration_of_the_datasheet() -> None:
 )
 def test_actual_scan_rates_are_those_of_the_device(wanted: float, actual: float) -> None:
     assert registers.actual_scan_rate(wanted) == pytest.approx(actual, rel=1e-8)
-
-
-@settings(max_examples=100)
-@given(st.binary(max_size=600))
-def test_any_feedback(pdu: bytes) -> None:
-    for parse in (registers.decode_feedback, AduFinder().receive, decode_response):
-        try:
-            parse(pdu)
-        except RemoteProtocolError:
-            continue

@@ -6,13 +6,13 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from daq.devices.modbus.registers_protocol import DataType, RegisterDecoder, RegisterMap
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
-from daq.protocols.errors import DeviceSettingError, RemoteProtocolError
+from daq.protocols.errors import DeviceSettingError
 
 MS = 1_000_000
 WITMOTION = RegisterMap.of({"preset": "witmotion"}, 3)
@@ -233,25 +233,3 @@ def test_the_ends_of_the_range_are_clipped() -> None:
     (block,) = decoder(rate=1.0).receive([0x7FFF], host(0), host(0))
     assert isinstance(block, Block)
     assert BlockFlag.CLIPPED in block.flags
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.lists(st.integers(0, 65535), max_size=10), max_size=30))
-def test_any_replies_are_decoded_or_refused(replies: list[list[int]]) -> None:
-    one = RegisterDecoder("A", WITMOTION, sampling_rate=20.0)
-    for k, reply in enumerate(replies):
-        if len(reply) == 7:
-            one.receive(reply, host(50 * k), host(50 * k + 5))
-        else:
-            with pytest.raises(RemoteProtocolError, match="expected 7"):
-                one.receive(reply, host(50 * k), host(50 * k + 5))
-    one.flush()
-    # and after that every valid reply counts
-    rows = []
-    for k in range(60):
-        registers = WITMOTION.encode(np.array([k, 0, 0]), time_ns=10**18 + k * 50 * MS)
-        reply = [registers[0x30 + r] for r in range(7)]
-        for item in one.receive(reply, host(3000 + 50 * k), host(3002 + 50 * k)):
-            if isinstance(item, Block):
-                rows += item.counts[:, 0].tolist()
-    assert rows == list(range(60))

@@ -180,15 +180,6 @@ def test_narrowest_differences() -> None:
     assert gcf.narrowest(np.array([0, 40000], np.int32)) == 32
 
 
-@given(st.binary(max_size=1100))
-def test_any_bytes(data: bytes) -> None:
-    try:
-        found = gcf.decode_block(data)
-    except RemoteProtocolError:
-        return
-    assert isinstance(found, (SampleBlock, StatusBlock))
-
-
 @given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=250))
 def test_any_samples(counts: list[int]) -> None:
     found = sample_block(gcf.encode_block(block(counts), width=32))
