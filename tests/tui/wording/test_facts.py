@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -12,19 +13,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.linalg import block_diag
 
 import huddle
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import Bridged, Snapshot
-from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics
+from daq.estimation.snapshot import Bridged, Octave, Snapshot
+from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import MethodRefused
 from daq.results.facts.model import ModelPasses
 from daq.results.facts.recordings import _OF_CAVEATS, BlocksDamaged, SensorsSimulated
 from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
-from estimator.checks.advice import Advice, Rank
-from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
+from estimator.checks.advice import Advice, Rank, Untested
+from estimator.checks.count_limits import CountLimits
+from estimator.self_noise.result import Flag
+from estimator.spectra.segment_rejection import Reason
+from tests.tui.example_snapshot import (
+    SETTINGS,
+    STRANGER,
+    diagnosed,
+    empty_snapshot,
+    made_snapshot,
+    rotation,
+)
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import assert_as_kept, result_of
 from tests.tui.wording.advice_examples import MISFIT
@@ -81,30 +93,92 @@ def test_all_words_of_all_kinds_are_as_kept() -> None:
     assert_as_kept(lines, Path(__file__).parent / "words.txt")
 
 
-def test_the_facts_of_made_results_are_as_kept() -> None:
+def _diagnosed_with(**changes: object) -> Snapshot:
+    """Return a snapshot with changes of its diagnostics."""
     whole = diagnosed()
+    return replace(whole, diagnostics=replace(whole.diagnostics, **changes))  # type: ignore[arg-type]  # of several types
+
+
+def _of_channels(column: int, factor: float) -> Snapshot:
+    change = np.eye(9)
+    change[column, column] = factor
+    return diagnosed(change)
+
+
+def _flagged(snapshot: Snapshot, flags: dict[Flag, tuple[slice, slice]]) -> Snapshot:
+    results = {}
+    for method, noise in snapshot.results.items():
+        found = noise.flags.copy()
+        for flag, at in flags.items():
+            found[at] |= flag
+        results[method] = replace(noise, flags=found)
+    return replace(snapshot, results=results)
+
+
+def _made() -> Iterator[tuple[str, Snapshot]]:
+    """Yield results with something that the first has not, or without what it has."""
+    whole = diagnosed()
+    yield "whole", whole
     (noise, *_) = whole.results.values()
     refused = {"maximum-likelihood": "expected what is not there"}
     clocks = (replace(whole.clocks[0], refined=False, drifts=True), *whole.clocks[1:])
-    made = {
-        "whole": whole,
-        "few averages": made_snapshot(n_effective=6.0),
-        "clocks that matter": made_snapshot(clock_share=0.3),
-        "a clock that drifts": replace(whole, clocks=clocks),
-        "nothing yet": empty_snapshot(),
-        "two channels": replace(
-            whole, results={"two-channel": replace(noise, method="two-channel")}
-        ),
-        "young": replace(empty_snapshot(), refused=refused, elapsed=1.0),
-        "refused while it runs": replace(made_snapshot(), refused=refused),
-        "refused, old, none": replace(whole, results={}, refused=refused, closed=False),
-        "refused, none": replace(whole, results={}, refused=refused),
-    }
-    lines = (
-        f"{name}: {fact.rank}, {fact.name}: {fact.words.line}"
-        for name, snapshot in made.items()
-        for fact in Result(snapshot, SETTINGS).facts
+    yield "few averages", made_snapshot(n_effective=6.0)
+    yield "clocks that matter", made_snapshot(clock_share=0.3)
+    yield "a clock that drifts", replace(whole, clocks=clocks)
+    yield "nothing yet", empty_snapshot()
+    results = {"two-channel": replace(noise, method="two-channel")}
+    yield "two channels", replace(whole, results=results)
+    yield "young", replace(empty_snapshot(), refused=refused, elapsed=1.0)
+    yield "refused while it runs", replace(made_snapshot(), refused=refused)
+    yield "refused, old, none", replace(whole, results={}, refused=refused, closed=False)
+    yield "refused, none", replace(whole, results={}, refused=refused)
+    once = tuple(replace(each, n_gaps=1, n_missing=1) for each in whole.sensors)
+    yield "one gap", replace(whole, sensors=once)
+    turns = (rotation(-2 * angle) for angle in (0.0, 5.0, 9.0))
+    yield "rotated the other way", diagnosed(block_diag(*turns))
+    yield "reversed", _of_channels(5, -1)
+    swapped = np.eye(9)
+    swapped[6:8] = swapped[[7, 6]]
+    yield "swapped", diagnosed(swapped)
+    everywhere, one = slice(None), slice(4, 5)
+    flags = {Flag.DEAD_CHANNEL: (everywhere, one), Flag.SINGULAR: (everywhere, slice(1))}
+    yield "dead", _flagged(_of_channels(4, 0), flags)
+    yield "pooled", _flagged(whole, {Flag.POOLED: (slice(20, 41), everywhere)})
+    octaves = (
+        Octave(0.0, 20.0, 20.0, 50, 47.0, {Reason.GAP: 1, Reason.TRANSIENT: 0}),
+        Octave(20.1, 100.0, 10.0, 100, 94.0, {Reason.GAP: 2, Reason.TRANSIENT: 3}),
     )
+    yield "octaves", replace(whole, octaves=octaves)
+    yield "one octave", replace(whole, octaves=octaves[1:])
+    many = (*whole.channels, *88 * whole.channels[-1:])
+    yield "many channels", replace(whole, channels=many, results={})
+    yield "clipped", _diagnosed_with(counts=CountLimits({3: 0.046}))
+    yield "stood still", _diagnosed_with(stood_still={4: 30.0})
+    yield "9 averages", diagnosed(n_effective=9.0)
+    for n_factors in (0, 1, 4, 6):
+        yield f"{n_factors} dimensions", diagnosed(n_factors=n_factors)
+    for why in Untested:
+        yield (
+            f"untested, {why}",
+            replace(made_snapshot(), diagnostics=SnapshotDiagnostics(untested=why)),
+        )
+    assert whole.diagnostics.diagnosis is not None
+    stranger = replace(whole.diagnostics.diagnosis, advice=(STRANGER,))
+    for late in (7e-3, 1e-5):
+        left = Synchronisation(residual={"A": late, "B": 0.0, "C": 1e-7})
+        yield f"{late} s late", _diagnosed_with(synchronisation=left)
+        yield f"{late} s late, elsewhere", _diagnosed_with(synchronisation=left, diagnosis=stranger)
+
+
+def test_the_facts_of_made_results_are_as_kept() -> None:
+    """Of all but the first, what differs from it: ``+`` what it has not, ``-`` what it has."""
+    lines: list[str] = []
+    first: list[str] = []
+    for name, snapshot in _made():
+        facts = [f"{fact.rank}, {fact.name}: {fact}" for fact in Result(snapshot, SETTINGS).facts]
+        lines += [f"{name}: + {fact}" for fact in facts if fact not in first]
+        lines += [f"{name}: - {fact.partition(':')[0]}" for fact in first if fact not in facts]
+        first = first or facts
     assert_as_kept(lines, Path(__file__).parent / "facts.txt")
 
 
