@@ -275,6 +275,7 @@ def _with_neighbours(
         n_effective=n_effective,
         correlation=correlation,
         inflation=inflation[rows],
+        unit=scale,
     )
     known = np.isfinite(pooled.noise).all(axis=1)
     here = rows[known]

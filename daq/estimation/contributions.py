@@ -90,7 +90,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
-    below = psd * _left_out(snapshot, method)[:, None]
+    below = psd * _left_out(snapshot, method)
     above = _in_a_dimension(snapshot, method)
     if dimensions.any() or below.any() or above.any():
         share = dimensions[:, None]
@@ -321,14 +321,15 @@ def _in_a_dimension(snapshot: Snapshot, method: str) -> FloatArray:
 def _left_out(snapshot: Snapshot, method: str) -> FloatArray:
     """Return how much of the noise may be motion, where fewer dimensions than usual are fitted.
 
-    As a share of the noise, shape (n_freqs,).
+    As a share of the noise, shape (n_freqs, n_channels). `Flag.POOLED` has all usual ones.
     """
     found = np.zeros(len(snapshot.frequency))
     for choice in snapshot.diagnostics.dimensions if method == "maximum-likelihood" else ():
         inside = (snapshot.frequency >= choice.low) & (snapshot.frequency <= choice.high)
         averages = _averages(snapshot, choice)
         found[inside] = choice.unseen(sum(snapshot.dims), averages, quantile=NORMAL_95)
-    return found
+    fewer = (snapshot.results[method].flags & Flag.POOLED) == 0
+    return np.asarray(found[:, None] * fewer)
 
 
 def _unseen(snapshot: Snapshot, method: str) -> FloatArray:

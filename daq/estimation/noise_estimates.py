@@ -560,6 +560,7 @@ def noise_estimates(
     """
     chosen, known = chosen or "auto" in settings.methods, known or {}
     settings = settings.for_sensors(dims)
+    usual = sorted(dims)[-3] if len(dims) > 2 else 0
     inflations = [_inflation(band, stability) for band in bands]
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
@@ -585,7 +586,8 @@ def noise_estimates(
                     )
                     options = [
                         {
-                            "n_factors": q,
+                            # the engine finds by itself which of the usual ones are not there
+                            "n_factors": np.maximum(q, usual) if dimensions.chosen else q,
                             "groups": noise_groups(dimensions.chosen, band.frequencies, len(dims)),
                         }
                         for q, band in zip(dimensions.n_factors, bands, strict=True)

@@ -21,8 +21,10 @@ neighbouring bins, and its scatter would contain the cost. Project, then pool:
    one sensor, corrected for the averages that the directions take. The matrices that whiten
    (weights only, so without bias) are the mean of the block, found in a few rounds.
 
-Dimensions in which the sensors agree no more than noise would are left in the noise; what motion
-they may hold widens the interval.
+Weak dimensions that a block does not show clearly are looked for together with its neighbours, to
+which it is like in units of its noise: motion that just does not show would be in the noise of all
+blocks, and in the mean of many whole. Dimensions in which the sensors agree no more than noise
+would are left in the noise; what motion they may hold widens the interval.
 
 k doubles while that resolves more dimensions and leaves four sub-blocks. The noise of a band is the
 mean of its bins; so are its cumulants with powers of the weights (`estimator.levels.interval`).
@@ -84,6 +86,10 @@ block, below which a line of that sensor stands out there like motion."""
 FELT = 0.5
 """Power of the least dimension in the other sensors, over what these show, below which it is less
 than that of their motion."""
+CLEARLY = 10.0
+"""Such standard deviations, from which a block needs no others to show its weak motion."""
+REACHES = (1, 3, 9, 99)
+"""Blocks to either side with which one looks for weak motion that it does not show clearly."""
 UNSEEN = 0.67
 """Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
 much that the interval holds the noise however much of this motion there is."""
@@ -215,6 +221,7 @@ def pooled_noise(
     n_effective: float,
     correlation: FloatArray,
     inflation: FloatArray | float = 1.0,
+    unit: FloatArray | float = 1.0,
 ) -> Pooled:
     """Estimate the noise of every bin from directions that neighbouring bins share.
 
@@ -236,6 +243,8 @@ def pooled_noise(
     inflation : float64, shape (n_freqs,), or float
         Variance of the averages over that of steady noise: of noise that changes, as many fewer
         averages show the motion. `cumulants` are those of steady noise.
+    unit : float64, shape (n_freqs, n_channels), or float
+        PSD that the matrix has as its unit. That of the first bin is taken for a block.
     """
     n_freqs, p = matrix.shape[:2]
     unknown = np.full((4, n_freqs, p), np.nan)
@@ -260,6 +269,7 @@ def pooled_noise(
                 sensor=sensor,
                 averages=table,
                 fewer=fewer[group],
+                unit=np.broadcast_to(unit, (n_freqs, p))[edges[group]],
             )
     return found
 
@@ -275,11 +285,12 @@ def _pool(
     sensor: IntArray,
     averages: FloatArray,
     fewer: FloatArray,
+    unit: FloatArray,
 ) -> None:
     """Write noise and cumulants of some blocks.
 
-    `begin`, `sizes` and `q` are first bins, numbers of bins and dimensions of the blocks;
-    `averages` are what so many bins are worth, over `fewer` of the block.
+    `begin`, `sizes`, `q` and `unit` are first bins, numbers of bins, dimensions and units of the
+    blocks; `averages` are what so many bins are worth, over `fewer` of the block.
     """
     p, n_effective = matrix.shape[1], float(averages[1])
 
@@ -290,7 +301,9 @@ def _pool(
 
     at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
-    whole = fit = _fitted(mean, parts, q, sensor, n_effective=n_effective, most=most, resolve=False)
+    whole = fit = _fitted(
+        mean, parts, q, sensor, unit=unit, n_effective=n_effective, most=most, resolve=False
+    )
     level, whitener, best = fit.level.copy(), fit.whitener.copy(), fit.resolved.copy()
     as_whole = np.ones(len(at), np.bool_)
     enough = np.searchsorted(averages[1:], max(FEW * q.max(), 1.5 * p) * fewer) + 1
@@ -314,7 +327,9 @@ def _pool(
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
-            fit = _fitted(mean, parts, q[more], sensor, n_effective=n_effective, most=most)
+            fit = _fitted(
+                mean, parts, q[more], sensor, unit=unit[more], n_effective=n_effective, most=most
+            )
             # a strong dimension whose response varies looks like a further one in a larger
             # sub-block; what leaks of it makes the noise of some channels larger
             noise = (np.abs(np.linalg.inv(whitener[more])) ** 2).sum(axis=2)
@@ -365,13 +380,14 @@ def _fitted(
     q: IntArray,
     sensor: IntArray,
     *,
+    unit: FloatArray,
     n_effective: float,
     most: int = 0,
     resolve: bool = True,
 ) -> _Fit:
     """Find directions and noise of blocks in a few rounds; no dimension resolved unless asked.
 
-    `mean` are the matrices of the sub-blocks.
+    `mean` are the matrices of the sub-blocks, `unit` are the units of the blocks.
     """
     p = mean.shape[1]
     own, N, whole = parts.block, parts.averages, parts.whole
@@ -379,7 +395,9 @@ def _fitted(
     r, wanted = np.zeros(len(q), np.int64), q
     at_most = np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
-    for turn in range(ROUNDS):
+    common: _Weak | None = None
+    turn = 0
+    while True:
         X = white(mean, whitener[own], sensor)
         U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
         if resolve:
@@ -388,34 +406,38 @@ def _fitted(
         V, g = _leading(U, r[own]), N / (N - np.minimum(n_own, r[own]))
         kept = parts.mean(np.eye(p) - V @ V.conj().swapaxes(1, 2))
         T = parts.mean(g[:, None, None] * without(X, V)) if resolve else X
-        filled = T + np.eye(p) - kept  # with the noise that resolved directions take
-        A = _axes(filled, int(at_most.max()))
-        shown = _shown(T, A, kept, resolved=r, wanted=at_most + r, averages=whole, sensor=sensor)
-        weak = np.minimum(shown, at_most - r)
+        shown = _weak(T, kept, resolved=r, most=at_most, averages=whole, sensor=sensor)
+        amplitude = whitener / np.sqrt(unit)[:, None]
+        if common is not None:
+            shown = shown.unless(common.number >= shown.number, common, amplitude)
+        weak = np.minimum(shown.number, at_most - r)
         q, g = r + weak, N / (N - n_own)
         Q = np.eye(p) - U @ U.conj().swapaxes(1, 2)
         if weak.any():
-            power = np.maximum((A.conj() * (filled @ A)).real.sum(axis=1) - 1, _FLOOR)
-            A = _leading(A * np.sqrt(power)[:, None], shown)
+            A = _leading(shown.motion, shown.number)
             W = _strongest(Q @ A[own], np.minimum(weak[own], q[own] - n_own))
             Q, U = Q - W @ W.conj().swapaxes(1, 2), np.concatenate([U, W], axis=2)
         rest = without(X, U)
-        loss = 1 + weak / np.maximum(whole - q, 1.0)
+        loss = 1 + weak / np.maximum(shown.averages - q, 1.0)
         y = g[:, None] * rest[:, a, b]
         noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
-        kept = parts.mean(np.einsum("bii->bi", Q).real)
-        floor = 0.5 / np.maximum(kept, 1e-9) / np.sqrt(whole)[:, None]
-        floor = np.maximum(floor, _FLOOR * np.einsum("bii->bi", parts.mean(X)).real)
+        left = np.maximum(parts.mean(np.einsum("bii->bi", Q).real), 1e-9)
+        floor = _FLOOR * np.einsum("bii->bi", parts.mean(X)).real
+        floor = np.maximum(floor, 0.5 / left / np.sqrt(whole)[:, None])
         size, axes = axes_of(noise, floor, sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
-        if turn == ROUNDS - 1 or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
-            break
+        turn += 1
+        if turn == ROUNDS or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
+            if common is not None:
+                break
+            common = _of_neighbours(
+                shown, T, kept, amplitude, resolved=r, most=at_most, averages=whole, sensor=sensor
+            )
+            if common is None:
+                break
+            turn = 0
         shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
         whitener = shorter @ whitener
-    # motion that the sensors' agreement does not show may be in the other dimensions
-    n_sensors = sensor[-1] + 1
-    hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
-    unseen = 1 + UNSEEN * hidden * np.maximum(1 - q / np.maximum(wanted, 1), 0) * (wanted > 0)
     root = np.asarray(np.linalg.inv(whitener), np.complex128)
     # noise of a bin is linear in the projected matrix
     weight = weights_beside(root, own, U, sensor)
@@ -425,11 +447,128 @@ def _fitted(
         white=rest,
         weight=weight,
         gain=g * loss[own],
-        left=n_effective * (1 - r[own] / N - weak[own] / whole[own]) / unseen[own],
+        left=n_effective
+        * (1 - r[own] / N - weak[own] / whole[own])
+        / _unseen(q, wanted, sensor)[own],
         resolved=r,
         whitener=whitener,
         level=loss[:, None] * parts.mean(times(weight, y).real),
     )
+
+
+def _unseen(q: IntArray, wanted: IntArray, sensor: IntArray) -> FloatArray:
+    """Return what multiplies the variance for motion in other dimensions that does not show."""
+    n_sensors, p = sensor[-1] + 1, len(sensor)
+    hidden = SHOWN * np.sqrt(2 * _degrees(sensor, q)) / ((1 - 1 / n_sensors) * p * n_sensors)
+    left = np.maximum(1 - q / np.maximum(wanted, 1), 0) * (wanted > 0)
+    return np.asarray(1 + UNSEEN * hidden * left)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Weak:
+    """Weak motion in some blocks.
+
+    ``motion``, shape (n_blocks, p, most), has columns of which the last ``number`` are directions
+    that show it, times its amplitude; the last of these shows it by ``clear`` standard deviations.
+    They are found from so many ``averages``.
+    """
+
+    motion: ComplexArray
+    number: IntArray
+    clear: FloatArray
+    averages: FloatArray
+
+    def unless(self, where: BoolArray, other: _Weak, amplitude: ComplexArray) -> _Weak:
+        """Return that of the other where asked, whose motion is multiplied by `amplitude`."""
+        return _Weak(
+            np.where(where[:, None, None], amplitude @ other.motion, self.motion),
+            np.where(where, other.number, self.number),
+            np.where(where, other.clear, self.clear),
+            np.where(where, other.averages, self.averages),
+        )
+
+
+def _weak(
+    T: ComplexArray,
+    projector: ComplexArray,
+    *,
+    resolved: IntArray,
+    most: IntArray,
+    averages: FloatArray,
+    sensor: IntArray,
+) -> _Weak:
+    """Find weak motion in the whitened mean matrices T without resolved dimensions.
+
+    `projector` is the mean of those that took these off.
+    """
+    filled = T + np.eye(len(sensor)) - projector  # with the noise that resolved directions take
+    axes = _axes(filled, int(most.max()))
+    power = np.maximum((axes.conj() * (filled @ axes)).real.sum(axis=1) - 1, _FLOOR)
+    number, clear = _shown(
+        T, axes, projector, resolved=resolved, wanted=most, averages=averages, sensor=sensor
+    )
+    return _Weak(axes * np.sqrt(power)[:, None], number, clear, averages)
+
+
+def _of_neighbours(
+    own: _Weak,
+    T: ComplexArray,
+    projector: ComplexArray,
+    amplitude: ComplexArray,
+    *,
+    resolved: IntArray,
+    most: IntArray,
+    averages: FloatArray,
+    sensor: IntArray,
+) -> _Weak | None:
+    """Find weak motion of blocks together with their neighbours; None if that shows no more.
+
+    `amplitude` makes whitened matrices of those in the unit that all blocks have, in which
+    responses are alike; the motion that is found is in this unit.
+    """
+    n, p = T.shape[:2]
+    rows = np.flatnonzero((own.number < most - resolved) | (own.clear < CLEARLY))
+    if n == 1 or not len(rows):
+        return None
+    back = np.linalg.inv(amplitude)
+    turn = amplitude[rows, None] @ back
+    turn *= np.sqrt(p / (np.abs(turn) ** 2).sum(axis=(2, 3)))[:, :, None, None]
+    adjoint = turn.conj().swapaxes(2, 3)
+    whole = np.stack([turn @ T @ adjoint, turn @ projector @ adjoint, turn @ adjoint])
+    power = np.maximum(np.linalg.eigvalsh(T)[:, -1], 1.0)
+    apart = sensor[:, None] != sensor
+    best = _Weak(back @ own.motion, own.number.copy(), own.clear.copy(), own.averages.copy())
+    better = np.zeros(n, np.bool_)
+    for reach in REACHES:
+        near = np.abs(np.arange(n) - rows[:, None]) <= reach
+        weight = near * averages / power
+        worth_of = weight.sum(axis=1) ** 2 / (weight**2 / averages).sum(axis=1)
+        weight /= weight.sum(axis=1, keepdims=True)
+        mean, kept, noise = np.einsum("bc,mbcij->mbij", weight, whole)
+        one = _power(noise, apart, -0.5)
+        with_others = _weak(
+            one @ mean @ one,
+            one @ kept @ one,
+            resolved=resolved[rows],
+            most=most[rows],
+            averages=worth_of,
+            sensor=sensor,
+        )
+        more = with_others.number > best.number[rows]
+        more |= (
+            (with_others.number == best.number[rows])
+            & (best.clear[rows] < CLEARLY)
+            & (with_others.clear > best.clear[rows])
+        )
+        at = rows[more]
+        motion = back[rows] @ np.linalg.inv(one) @ with_others.motion
+        best.motion[at, :, -motion.shape[2] :] = motion[more]
+        best.number[at] = with_others.number[more]
+        best.clear[at] = with_others.clear[more]
+        best.averages[at] = worth_of[more]
+        better[at] = True
+    best.number[~better] = -1
+    return best if better.any() else None
 
 
 def _start(mean: ComplexArray, parts: _Parts, sensor: IntArray) -> ComplexArray:
@@ -729,15 +868,16 @@ def _shown(
     wanted: IntArray,
     averages: FloatArray,
     sensor: IntArray,
-) -> IntArray:
+) -> tuple[IntArray, FloatArray]:
     """Return how many weak dimensions of each block show: with fewer, sensors agree beyond noise.
 
-    `T` is the whitened mean matrix without resolved dimensions, `axes` are its eigenvectors,
-    ascending, and `projector` is the mean of those that took the resolved dimensions off.
+    And by how many standard deviations the last one does. `T` is the whitened mean matrix without
+    resolved dimensions, `axes` are its eigenvectors, ascending, and `projector` is the mean of
+    those that took the resolved dimensions off.
     """
     n, p = T.shape[:2]
     apart = sensor[:, None] != sensor
-    found = wanted - resolved
+    found, clear = wanted.copy(), np.full(n, np.inf)
     open_ = np.ones(n, np.bool_)
     rest, kept = T, projector
     for number in range(int(found.max(initial=0))):
@@ -750,10 +890,12 @@ def _shown(
         error = np.abs(white(rest, alike, sensor) - kept) ** 2
         degrees = _degrees(sensor, resolved + number)
         statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
-        fits = statistic < degrees + SHOWN * np.sqrt(2 * degrees)
-        found = np.where(open_ & fits, np.minimum(found, number), found)
-        open_ &= ~fits
-    return found
+        excess = (statistic - degrees) / np.sqrt(2 * degrees)
+        open_ &= number < wanted
+        clear = np.where(open_ & (excess >= SHOWN), excess, clear)
+        found = np.where(open_ & (excess < SHOWN), number, found)
+        open_ &= excess >= SHOWN
+    return found, clear
 
 
 def _power(matrix: ComplexArray, apart: BoolArray, exponent: float) -> ComplexArray:
