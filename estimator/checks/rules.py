@@ -22,7 +22,7 @@ import numpy as np
 
 from estimator.checks import advice_on_model, advice_on_sensors, advice_on_signals
 from estimator.checks.advice import Advice, Rank
-from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.shared_motion import outsiders
@@ -193,9 +193,15 @@ def advise(
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
     ]
+    failed = [e for e in others if isinstance(e, advice_on_model.ModelMisfit) and e.is_wrong]
     found = [
         *_absent(given, dims),
-        *further,
+        # motion that the model lacks is noise to parts of time, and changes as motion does
+        *(
+            each
+            for each in further
+            if not (isinstance(each, NoiseChanges) and any(_overlap(each, e) for e in failed))
+        ),
         *strangers,
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
         *(advice for response in responses for advice in orientation(response, dims, nyquist)),

@@ -12,6 +12,7 @@ from daq.estimation import snapshot_builder
 from daq.estimation.noise_estimates import Estimates, noise_estimates
 from daq.estimation.settings import Settings
 from daq.results.result import Result
+from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 
 RATE = 40.0
@@ -130,6 +131,20 @@ def test_levels_are_estimated_once_with_the_noise_that_changes(
     huddle.self_noise(samples, fs=RATE, segment="5s")
     (stability,) = [used for used, found in made if found.results]
     assert stability.inflations.min() == 1 < stability.inflations.max()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_motion_by_other_axes_is_a_misfit_and_no_noise_that_changes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    loud = 14 * np.exp(rng.standard_normal(12)).repeat(N // 12)[:, None]
+    motion = loud * rng.standard_normal((N, 3))
+    axes = np.hstack([np.ones((4, 1)), 0.1 * rng.standard_normal((4, 2))])
+    samples = {
+        name: motion @ axis[:, None] + rng.standard_normal((N, 1))
+        for name, axis in zip("ABCD", axes, strict=True)
+    }
+    found = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot.diagnostics.advice
+    assert {ModelMisfit, NoiseChanges} & {type(each) for each in found} == {ModelMisfit}
 
 
 @pytest.mark.long
