@@ -175,7 +175,7 @@ def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     if not share.any():
         return []
     share = np.where(within, share, np.where(share > MUCH_CHANGED, 1.0, WITHIN * share))
-    below, above = (psd * np.clip(part, 0.0, 1.0) for part in (share, -share))
+    below, above = psd * np.clip(share, 0.0, 1.0), psd * np.maximum(-share, 0.0)
     return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
 
 

@@ -133,6 +133,9 @@ def steadied(
     within = np.zeros((len(insides), p))
     for number, course in courses.items():
         within[number] = MARGIN * (averages / averages.sum()) @ course[kept]
+    if courses:  # bands without a good frequency: as the worst of others
+        most = within[np.abs(within).argmax(axis=0), np.arange(p)]
+        within[[number not in courses for number in range(len(insides))]] = most
     csm = np.full((len(good), p, p), np.nan, np.complex128)
     more = float((averages - q).sum()) + q
     for some, found in _regressions(parts, at, psd, places, groups):
