@@ -23,13 +23,7 @@ from typing import Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
-from daq.estimation.freed_memory import (
-    M_MMAP_THRESHOLD,
-    M_TRIM_THRESHOLD,
-    c_function,
-    give_back,
-    reuse,
-)
+from daq.estimation.freed_memory import c_function, give_back, limit, reuse
 from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
@@ -47,7 +41,6 @@ LARGE = 1 << 21
 of 2 h of three triaxial sensors: 2 s without mappings, 8 s with this limit, 14 s with 128 kB; the
 peaks are 237, 187 and 181 MB. Arrays of a live estimate are smaller."""
 _M_ARENA_MAX, _HEAPS = -8, 2  # of malloc.h
-_RETURNED = 1 << 17
 
 
 class FreedMemory:
@@ -55,11 +48,10 @@ class FreedMemory:
 
     def __init__(self) -> None:
         self._next = 0.0
-        option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
         reuse()  # not again, by an estimate beside
+        limit(mapped=LARGE, returned=1 << 17)
+        option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
         if option is not None:
-            option(M_MMAP_THRESHOLD, LARGE)
-            option(M_TRIM_THRESHOLD, _RETURNED)
             option(_M_ARENA_MAX, _HEAPS)
 
     def give_back(self) -> None:

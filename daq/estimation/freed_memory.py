@@ -9,10 +9,15 @@ from functools import cache
 
 FREED_FROM = 1 << 25
 """Bytes of the matrices of all frequencies from which an estimate returns memory between stages."""
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Of malloc.h: free bytes at the end of the memory from which they return to the system, and size
-of an array from which it gets a mapping of its own."""
-_MAPPED, _RETURNED = 1 << 25, 1 << 26  # mappings of arrays cost their pages anew
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+
+
+def limit(*, mapped: int, returned: int) -> None:
+    """Set the bytes of an array that gets a mapping of its own, and of free memory not to keep."""
+    option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
+    if option is not None:
+        option(_M_MMAP_THRESHOLD, mapped)
+        option(_M_TRIM_THRESHOLD, returned)
 
 
 @cache
@@ -22,10 +27,7 @@ def reuse() -> None:
     Fresh pages take a seventh of the processor time of an estimate of hours, and a fourth with
     rejection. Its peak is 50 MB higher.
     """
-    option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
-    if option is not None:
-        option(M_MMAP_THRESHOLD, _MAPPED)
-        option(M_TRIM_THRESHOLD, _RETURNED)
+    limit(mapped=1 << 25, returned=1 << 26)
 
 
 def give_back() -> None:

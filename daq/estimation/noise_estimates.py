@@ -565,15 +565,11 @@ def noise_estimates(
     results: dict[str, SelfNoise] = {}
     refused: dict[str, str] = {}
     changing: MultiPart | None = None
-    wanted = [
-        each
-        for each in (ALL_METHODS if "all" in settings.methods else settings.methods)
-        if levels or each == "maximum-likelihood"
-    ]
+    wanted = list(ALL_METHODS if "all" in settings.methods else settings.methods)
     with np.errstate(invalid="ignore", divide="ignore"):  # responses vanish at 0 Hz
         for method in wanted:
             try:
-                if method == "multi-part":
+                if method == "multi-part" and levels:
                     changing = _by_changes(bands, settings, dims, shared)
                     results[method] = changing.noise
                     continue

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daq.bench.units import conversion, is_motion
-from estimator.checks.relative_response import RelativeResponse, relative_response
+from estimator.checks.relative_response import PARTNERS, RelativeResponse, relative_response
 from estimator.errors import EstimatorError
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ SEGMENT = 1.0
 """Seconds of a segment: longer than delays between sensors."""
 MIN_RATE = 20.0
 """Hz: slower sensors have too few frequencies in a segment."""
-PARTNERS = 6
-"""Sensors with which each one is compared; all pairs of a large bench would take long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ from estimator.checks.band import BandDiagnosis
 from estimator.checks.disturbed_segments import SegmentCourse
 from estimator.checks.noise_within import beside_matrices
 from estimator.checks.relative_response import (
+    PARTNERS,
     PairProducts,
     RelativeResponse,
     relative_response,
@@ -76,8 +77,6 @@ LEAST_KNOWN = 0.2
 """Standard error of a part's noise, as a fraction, up to which changes are reported."""
 LARGE = 0.5
 SMALL = 0.05
-PARTNERS = 6
-"""Sensors, spread over the bench, with which each sensor is compared."""
 
 
 def changes(
@@ -179,7 +178,7 @@ class Diagnostics:
         Why the model was tested at no frequency; None if it was tested.
     bands : tuple of BandDiagnosis
     responses : tuple of RelativeResponse
-        Of the comparable pairs, sensors with all their channels, of which one is among `PARTNERS`.
+        Of sensors with all their channels, each with `PARTNERS` that are spread over the bench.
     advice : tuple of Advice
         Most severe first.
     stability : Stability or None
@@ -508,7 +507,7 @@ def _test(
 
 
 def _compared(there: PresentSensors, found: list[RelativeResponse]) -> Iterator[tuple[int, int]]:
-    """Yield like sensors, one of them among `PARTNERS`; the first with a response is always."""
+    """Yield pairs of like sensors, one of `PARTNERS` over the bench; the first that fits is one."""
     for d in sorted(set(there.dims)):  # motion along a missing channel is unknown
         whole = [n for n, s in enumerate(there.sensors) if s in there.whole and there.dims[n] == d]
         before = len(found)

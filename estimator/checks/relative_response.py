@@ -40,6 +40,8 @@ from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _Numbers = TypeVar("_Numbers", "ComplexArray", "FloatArray")
 
+PARTNERS = 6
+"""Sensors with which each one of a bench is compared: all pairs would take long."""
 _NEAREST, _FARTHEST = 0.3, 1.2  # rivals that are examined: cycles from the delay, either way
 _STEP = 0.02  # cycles; the maximum is refined by a parabola
 _CORRELATION = 2.0  # variance of a sum over that of independent frequencies, with tapered windows
