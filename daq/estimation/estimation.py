@@ -39,7 +39,7 @@ from daq.estimation.equalisation import (
     ROUNDS,
     Equalisation,
 )
-from daq.estimation.freed_memory import FREED_FROM, give_back, reuse
+from daq.estimation.freed_memory import reused
 from daq.estimation.noise_estimates import Dimensions, averages
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -477,10 +477,7 @@ def estimate(
     NoResultError
         If there is too little for any of the methods.
     """
-    reuse()
-    with Estimation(paths, settings) as estimation:
+    with reused(), Estimation(paths, settings) as estimation:
         snapshot = estimation.finish(progress)
-    if snapshot.csm.nbytes > FREED_FROM:
         del estimation
-        give_back()
     return snapshot

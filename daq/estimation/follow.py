@@ -23,7 +23,7 @@ from typing import Protocol
 
 from daq.errors import HuddleError, NotConnectedError, RecordingError
 from daq.estimation.estimation import Estimation
-from daq.estimation.freed_memory import c_function, give_back, limit, reuse
+from daq.estimation.freed_memory import c_function, give_back, limit
 from daq.estimation.recording_set import is_continued, is_left
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
@@ -36,10 +36,6 @@ from daq.recording.storage import locking
 
 INTERVAL = 20.0
 """Seconds between returns, at least."""
-LARGE = 1 << 21
-"""Size in bytes from which an array gets a mapping of its own. Mappings cost system time. Estimate
-of 2 h of three triaxial sensors: 2 s without mappings, 8 s with this limit, 14 s with 128 kB; the
-peaks are 237, 187 and 181 MB. Arrays of a live estimate are smaller."""
 _M_ARENA_MAX, _HEAPS = -8, 2  # of malloc.h
 
 
@@ -48,8 +44,7 @@ class FreedMemory:
 
     def __init__(self) -> None:
         self._next = 0.0
-        reuse()  # not again, by an estimate beside
-        limit(mapped=LARGE, returned=1 << 17)
+        limit()
         option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
         if option is not None:
             option(_M_ARENA_MAX, _HEAPS)

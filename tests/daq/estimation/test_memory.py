@@ -50,8 +50,7 @@ def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
 _ARRAYS_AGAIN = """
 import numpy as np
 from resource import RUSAGE_SELF, getrusage
-from daq.estimation.follow import FreedMemory
-from daq.estimation.freed_memory import reuse
+from daq.estimation.freed_memory import reused
 
 def faults() -> int:
     before = getrusage(RUSAGE_SELF).ru_minflt
@@ -59,22 +58,20 @@ def faults() -> int:
         np.ones(2_000_000), np.ones(1_000_000)
     return getrusage(RUSAGE_SELF).ru_minflt - before
 
-reuse()
-print(faults() * 0 + faults())
-FreedMemory()
-reuse()
+with reused():
+    print(faults() * 0 + faults())
 print(faults())
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="its C library may keep no memory")
-def test_new_arrays_take_the_memory_of_freed_ones_unless_a_recording_is_followed() -> None:
+def test_an_estimate_makes_arrays_in_the_memory_of_freed_ones() -> None:
     ended = subprocess.run(
         [sys.executable, "-c", _ARRAYS_AGAIN], capture_output=True, text=True, check=True
     )
-    again, followed = map(int, ended.stdout.split())
+    again, later = map(int, ended.stdout.split())
     pages = 20 * 24_000_000 // 4096
-    assert again < pages / 100 < pages / 20 < followed  # some pages are large ones
+    assert again < pages / 100 < pages / 20 < later  # some pages are large ones
 
 
 def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
