@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,7 @@ from estimator.spectra.segment_rejection import Reason
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-Parameters = ParamSpec("Parameters")
-Derived = TypeVar("Derived")
+Derive = TypeVar("Derive", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +312,7 @@ class Snapshot:
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     parts: Parts | None = None
     rejected: tuple[RejectedSegment, ...] = ()
-    derived: dict[tuple[str, ...], Any] = field(default_factory=dict, init=False, repr=False)
+    derived: dict[tuple[object, ...], Any] = field(default_factory=dict, init=False, repr=False)
     """What `once` has derived of it; a changed copy begins anew."""
 
     @property
@@ -375,17 +374,14 @@ class NoResultError(InsufficientDataError):
         self.snapshot = snapshot
 
 
-def once(
-    derive: Callable[Concatenate[Snapshot, Parameters], Derived],
-) -> Callable[Concatenate[Snapshot, Parameters], Derived]:
-    """Return a function that derives something of a snapshot, and of names, once for each."""
+def once(derive: Derive) -> Derive:
+    """Return a function, or method, that derives each thing once of what has a dict ``derived``."""
 
     @wraps(derive)
-    def kept(snapshot: Snapshot, /, *names: Parameters.args, **none: Parameters.kwargs) -> Derived:
-        key = (derive.__name__, *map(str, names))
-        if key not in snapshot.derived:
-            snapshot.derived[key] = derive(snapshot, *names, **none)
-        found: Derived = snapshot.derived[key]
-        return found
+    def kept(of: Any, *given: object) -> Any:  # noqa: ANN401 - as `derive` states
+        key = (derive.__name__, *given)
+        if key not in of.derived:
+            of.derived[key] = derive(of, *given)
+        return of.derived[key]
 
-    return kept
+    return cast("Derive", kept)

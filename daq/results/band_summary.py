@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from daq.estimation.contributions import contributions, may_share, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import ChannelLabel, Snapshot
+from daq.estimation.snapshot import ChannelLabel, Snapshot, once
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.levels.bands import (
     BandLevels,
@@ -348,13 +349,7 @@ class Estimate:
 
     snapshot: Snapshot
     settings: Settings
-    _spectra: dict[str, Spectrum] = field(default_factory=dict, init=False, repr=False)
-    _levels: dict[tuple[str, tuple[float, float]], Levels] = field(
-        default_factory=dict, init=False, repr=False
-    )
-    _means: dict[tuple[str, tuple[float, float], frozenset[Source]], tuple[BandMeans, ...]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    derived: dict[tuple[object, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def band(self) -> tuple[float, float]:
@@ -386,12 +381,10 @@ class Estimate:
         """Channels, by column, whose noise cannot be told from motion in the band."""
         return without_partners(self.snapshot, self.band)
 
+    @once
     def spectrum(self, method: str) -> Spectrum:
         """Return the noise by a method, from which levels of any bands are made."""
-        if method not in self._spectra:
-            noise = self.snapshot.results[method]
-            self._spectra[method] = Spectrum(noise, self.snapshot, self.settings)
-        return self._spectra[method]
+        return Spectrum(self.snapshot.results[method], self.snapshot, self.settings)
 
     def means(
         self,
@@ -416,12 +409,14 @@ class Estimate:
         BandError
             If no frequency lies in the band.
         """
-        key = method, self.band if band is None else band, without
-        if key not in self._means:
-            found = self.levels(method, key[1])
-            columns = range(len(self.snapshot.channels))
-            self._means[key] = tuple(found.of_channel(n, without=without) for n in columns)
-        return self._means[key]
+        return self._means(method, self.band if band is None else band, without)
+
+    @once
+    def _means(
+        self, method: str, band: tuple[float, float], without: frozenset[Source]
+    ) -> tuple[BandMeans, ...]:
+        found, columns = self.levels(method, band), range(len(self.snapshot.channels))
+        return tuple(found.of_channel(n, without=without) for n in columns)
 
     @cached_property
     def covs(self) -> list[float]:
@@ -471,12 +466,10 @@ class Estimate:
             total = snapshot.elapsed + left
         return Precision(cov=cov, target=target, seconds_left=left, total=total)
 
+    @once
     def levels(self, method: str, band: tuple[float, float]) -> Levels:
         """Return the noise of every channel by a method in one band: `Spectrum.levels`."""
-        if (method, band) not in self._levels:
-            edges = band_edges(self.snapshot.frequency, band)
-            self._levels[method, band] = self.spectrum(method).levels(edges)
-        return self._levels[method, band]
+        return self.spectrum(method).levels(band_edges(self.snapshot.frequency, band))
 
 
 def data_interval(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
