@@ -527,7 +527,8 @@ def _of_neighbours(
     responses are alike; the motion that is found is in this unit.
     """
     n, p = T.shape[:2]
-    rows = np.flatnonzero((own.number < most - resolved) | (own.clear < CLEARLY))
+    left = most - resolved  # not those that the block resolves
+    rows = np.flatnonzero((left > 0) & ((own.number < left) | (own.clear < CLEARLY)))
     if n == 1 or not len(rows):
         return None
     back = np.linalg.inv(amplitude)
@@ -550,7 +551,7 @@ def _of_neighbours(
             one @ mean @ one,
             one @ kept @ one,
             resolved=resolved[rows],
-            most=most[rows],
+            most=left[rows],
             averages=worth_of,
             sensor=sensor,
         )

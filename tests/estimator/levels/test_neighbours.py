@@ -93,3 +93,32 @@ def test_motion_too_weak_for_one_third_of_an_octave_is_found_with_others(
     assert abs(np.mean(errors)) < 3 * spread / np.sqrt(54) + 0.001
     assert (np.abs(np.array(errors) / spreads) < 1.96).mean() > 0.9
     assert np.median(spreads) < 0.0125  # 0.008 with strong motion
+
+
+def test_motion_that_a_third_of_an_octave_resolves_is_not_looked_for_with_others() -> None:
+    """One sensor is 40 dB noisier, responses vary by 20 %: the noise was 4 times too high."""
+    rng = np.random.default_rng(54)
+    n, n_freqs = 30, 400
+    frequency = 0.1 * np.arange(1, n_freqs + 1, dtype=np.float64)
+    octaves = np.arange(10)
+    response = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
+    course = np.log2(frequency / frequency[0])
+    varying = np.array(
+        [np.interp(course, octaves, 0.2 * rng.standard_normal(10)) for _ in range(18)]
+    )
+    response = response * np.exp(varying[:9] + 1j * varying[9:]).T[:, :, None]
+    noise = np.repeat([1.0, 1.0, 1e4], 3)
+    motion = np.sqrt(21 / 2) * _complex(rng, (n_freqs, n, 3))
+    x = np.einsum("fpq,fnq->fnp", response, motion)
+    x += np.sqrt(noise / 2) * _complex(rng, (n_freqs, n, 9))
+    found = self_noise(
+        "maximum-likelihood",
+        np.einsum("fnp,fnq->fpq", x, x.conj()) / n,
+        dims=(3, 3, 3),
+        n_effective=float(n),
+        blocks=blocks_of(frequency),
+    )
+    held = band_levels(found.noise_psd, found.cumulants, np.array([10, 398]), np.ones(1))
+    low, high = held.interval()
+    assert ((low[0] <= noise) & (noise <= high[0])).mean() > 0.7
+    assert np.median(held.mean[0] / noise) < 1.5
