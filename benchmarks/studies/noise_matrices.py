@@ -36,6 +36,8 @@ INDEPENDENT, WITHIN, RANK_TWO, ELEMENT = "none", "one sensor", "rank two", "one 
 PAIR = "two sensors"
 TURNING, STEEP, LINES = "turning motion", "steep motion", "lines"
 """Motion that differs between bins: in its polarisation, by 60 dB over the band, in three bins."""
+WEAK, WEAK_BANDS, WEAKER = "weak motion, ten bands", 10, 0.1
+"""The mean over so many bands, with so much of the motion: what no band shows by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,11 @@ class Cell:
     ratio: float
     n: int
     shared: str = INDEPENDENT
+
+    @property
+    def n_bins(self) -> int:
+        """Bins of which the level is the mean."""
+        return N_BINS * (WEAK_BANDS if self.shared == WEAK else 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +75,7 @@ def scene(cell: Cell, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]
     d = cell.d
     turned = [np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(cell.n_sensors)]
     loadings = np.concatenate(turned) * np.sqrt(cell.ratio * np.array([1.0, 1.4, 0.7])[:d])
+    loadings *= np.sqrt(WEAKER if cell.shared == WEAK else 1.0)
     loadings *= 1 + 0.02 * rng.standard_normal((len(loadings), 1))
     noise = np.eye(len(loadings))
     sources = np.array(SHARED)[: 2 if cell.shared == RANK_TWO else 1, :d]
@@ -83,9 +91,9 @@ def scene(cell: Cell, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]
 
 
 def path(cell: Cell, rng: np.random.Generator) -> ComplexArray:
-    """Return how d sources move d axes at each bin, shape (N_BINS, d, d)."""
+    """Return how d sources move d axes at each bin, shape (n_bins, d, d)."""
     d = cell.d
-    along = np.broadcast_to(np.eye(d, dtype=np.complex128), (N_BINS, d, d)).copy()
+    along = np.broadcast_to(np.eye(d, dtype=np.complex128), (cell.n_bins, d, d)).copy()
     if cell.shared == TURNING:
         taps = rng.standard_normal((24, d, d)) * np.exp(-np.arange(24) / 6)[:, None, None]
         delay = np.exp(-1j * np.linspace(0.2, 2.4, N_BINS)[:, None] * np.arange(24))
@@ -137,7 +145,7 @@ def study(cell: Cell, n_draws: int, *, seed: int = 46) -> Found:
         loadings, noise = scene(cell, rng)
         A = loadings @ path(cell, rng)
         drawn = averaged(A @ A.conj().swapaxes(1, 2) + noise, cell.n, rng)
-        dims, block = (cell.d,) * cell.n_sensors, np.zeros(N_BINS, np.int64)
+        dims, block = (cell.d,) * cell.n_sensors, np.arange(cell.n_bins) // N_BINS
         options: dict[str, Any] = {}
         reach = np.ones((2, len(noise)))
         if cell.shared == PAIR:
@@ -155,13 +163,15 @@ def study(cell: Cell, n_draws: int, *, seed: int = 46) -> Found:
             blocks=block,
             **options,
         )
-        level = band_levels(found.noise_psd, found.cumulants, np.array([0, N_BINS]), np.ones(1))
+        level = band_levels(
+            found.noise_psd, found.cumulants, np.array([0, cell.n_bins]), np.ones(1)
+        )
         low, high = (end * by for end, by in zip(level.interval(), reach, strict=True))
         truth = np.diag(noise)
         held.append((low[0] <= truth) & (truth <= high[0]))
         if cell.shared == PAIR:  # no bound: that of one matrix for both
             continue
-        least = NORMAL_95 * bound(loadings, noise, cell.d, cell.n * N_BINS)
+        least = NORMAL_95 * bound(loadings, noise, cell.d, cell.n * cell.n_bins)
         widths.append((high - low)[0] / 2 / least)
     second = np.array(held)[:, cell.d : 2 * cell.d]
     return Found(
@@ -179,7 +189,7 @@ def main(n_draws: int, layouts: tuple[tuple[int, int], ...], averages: tuple[int
     print("|---|---|---|" + "---|" * len(RATIOS))
     for (s, d), n in product(layouts, averages):
         shared = (INDEPENDENT, WITHIN, RANK_TWO, ELEMENT)[: 1 if d == 1 else 2 if d == 2 else 4]
-        kinds = *shared, *(() if s == 3 else (PAIR,)), TURNING, STEEP, LINES
+        kinds = *shared, *(() if s == 3 else (PAIR,)), TURNING, STEEP, LINES, WEAK
         for kind in kinds if n > s * d else ():
             draws = max(2, -(-n_draws * 9 // (s * d)))
             cells = [study(Cell(s, d, ratio, n, kind), draws) for ratio in RATIOS]
