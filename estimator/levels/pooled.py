@@ -400,9 +400,10 @@ def _fitted(
     while True:
         X = white(mean, whitener[own], sensor)
         U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
+        taken, weakly = np.zeros(len(own)), np.zeros(len(q))
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
-            U, n_own = _resolved(X, r, wanted, parts, sensor)
+            U, n_own, taken = _resolved(X, r, wanted, parts, sensor)
         V, g = _leading(U, r[own]), N / (N - np.minimum(n_own, r[own]))
         kept = parts.mean(np.eye(p) - V @ V.conj().swapaxes(1, 2))
         T = parts.mean(g[:, None, None] * without(X, V)) if resolve else X
@@ -411,20 +412,19 @@ def _fitted(
         if common is not None:
             shown = shown.unless(common.number >= shown.number, common, amplitude)
         weak = np.minimum(shown.number, at_most - r)
-        q, g = r + weak, N / (N - n_own)
+        q, g = r + weak, N / (N - taken)
         Q = np.eye(p) - U @ U.conj().swapaxes(1, 2)
         if weak.any():
             A = _leading(shown.motion, shown.number)
+            power = (np.abs(_leading(A, weak)) ** 2).sum(axis=1)
+            weakly = np.where(shown.clear >= CLEARLY, _taken(power), weak)
             W = _strongest(Q @ A[own], np.minimum(weak[own], q[own] - n_own))
             Q, U = Q - W @ W.conj().swapaxes(1, 2), np.concatenate([U, W], axis=2)
         rest = without(X, U)
-        loss = 1 + weak / np.maximum(shown.averages - q, 1.0)
+        loss = 1 + weakly / np.maximum(shown.averages - q, 1.0)
         y = g[:, None] * rest[:, a, b]
         noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
-        left = np.maximum(parts.mean(np.einsum("bii->bi", Q).real), 1e-9)
-        floor = _FLOOR * np.einsum("bii->bi", parts.mean(X)).real
-        floor = np.maximum(floor, 0.5 / left / np.sqrt(whole)[:, None])
-        size, axes = axes_of(noise, floor, sensor)
+        size, axes = axes_of(noise, _least(X, Q, parts), sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
         turn += 1
         if turn == ROUNDS or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
@@ -454,6 +454,13 @@ def _fitted(
         whitener=whitener,
         level=loss[:, None] * parts.mean(times(weight, y).real),
     )
+
+
+def _least(X: ComplexArray, Q: ComplexArray, parts: _Parts) -> FloatArray:
+    """Return the least noise that weights follow, shape (n_blocks, p), beside its scatter."""
+    left = np.maximum(parts.mean(np.einsum("bii->bi", Q).real), 1e-9)
+    power = np.einsum("bii->bi", parts.mean(X)).real
+    return np.asarray(np.maximum(_FLOOR * power, 0.5 / left / np.sqrt(parts.whole)[:, None]))
 
 
 def _unseen(q: IntArray, wanted: IntArray, sensor: IntArray) -> FloatArray:
@@ -668,8 +675,8 @@ def _strongest(V: ComplexArray, number: IntArray) -> ComplexArray:
 
 def _resolved(
     X: ComplexArray, r: IntArray, q: IntArray, parts: _Parts, sensor: IntArray
-) -> tuple[ComplexArray, IntArray]:
-    """Return directions of r of q dimensions in each sub-block, and how many are its own.
+) -> tuple[ComplexArray, IntArray, FloatArray]:
+    """Return directions of r of q dimensions in each sub-block, how many are its own, and `_taken`.
 
     Its own where they stand out, all q where these do whichever sensor is left out. Others of r, of
     weak motion, are those of the nearest sub-block of its block that has r.
@@ -692,6 +699,7 @@ def _resolved(
     stands = stands[:, 1:] & (columns < number[:, None])
     U, n_own = axes[:, :, 1:] * stands[:, None], stands.sum(axis=1)
     _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
+    taken = _taken((U.conj() * (X @ U)).real.sum(axis=1) - (np.abs(U) ** 2).sum(axis=1))
     lacks = r[here] - n_own
     some = np.logical_or.reduceat(lacks <= 0, parts.first)[here]
     at = np.flatnonzero(some & (lacks > 0))
@@ -700,7 +708,16 @@ def _resolved(
         rest = theirs - U[at] @ (U[at].conj().swapaxes(1, 2) @ theirs)
         beside = (np.arange(most) + n_own[at, None]) % most
         U[at] = U[at] + np.take_along_axis(_strongest(rest, lacks[at]), beside[:, None], axis=2)
-    return U, n_own
+    return U, n_own, taken
+
+
+def _taken(power: FloatArray) -> FloatArray:
+    """Return how many averages directions take that are estimated from them, shape (n,).
+
+    `power` is that of the motion over the noise, (n, n_directions); zero where there is none. To
+    first order it is ``sum(1 + 1 / power)`` (Passemier, Li and Yao, JRSS B 79, 2017).
+    """
+    return np.asarray(np.where(power > 0, 1 + 1 / np.maximum(power, _FLOOR), 0.0).sum(axis=1))
 
 
 def _leave_lines(
