@@ -699,7 +699,9 @@ def _resolved(
     stands = stands[:, 1:] & (columns < number[:, None])
     U, n_own = axes[:, :, 1:] * stands[:, None], stands.sum(axis=1)
     _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
-    taken = _taken((U.conj() * (X @ U)).real.sum(axis=1) - (np.abs(U) ** 2).sum(axis=1))
+    there = (np.abs(U) ** 2).sum(axis=1)
+    along = (U.conj() * (X @ U)).real.sum(axis=1) - there
+    taken = _taken(np.where(there > 0.5, np.maximum(along, OUTSTANDING - 1), 0.0))
     lacks = r[here] - n_own
     some = np.logical_or.reduceat(lacks <= 0, parts.first)[here]
     at = np.flatnonzero(some & (lacks > 0))
