@@ -240,6 +240,7 @@ def _with_neighbours(
     left = np.bincount(sensor[columns], minlength=len(dims))
     live = tuple(int(n) for n in left if n)
     usual = _shared(live)
+    n_dims = np.where(n_dims > _shared(dims), n_dims, np.minimum(n_dims, usual))
     fits = bool(usual) and max(live) == usual
     # parallel sensors give one problem for each channel, with its share of the dimensions
     alike = len(live) - -(-n_dims // max(usual, 1))

@@ -145,3 +145,22 @@ def test_directions_of_motion_near_the_noise_take_more_of_it() -> None:
         held = band_levels(found.noise_psd, found.cumulants, whole, np.ones(1))
         z.append((held.mean[0] - 1) / held.spread[0])
     assert abs(np.mean(z)) < 0.35
+
+
+def test_an_axis_that_is_dead_in_all_sensors_feels_no_dimension_of_the_motion() -> None:
+    """There were more dimensions than live channels of a sensor, and neighbours were not used."""
+    rng = np.random.default_rng(55)
+    n = 40
+    x = _complex(rng, (60, n, 12)) + 0.5 * np.tile(_complex(rng, (60, n, 3)), 4)
+    csm = np.einsum("fnp,fnq->fpq", x, x.conj()) / n
+    live = np.arange(12) % 3 < 2
+    csm[:, ~live] = csm[:, :, ~live] = 0
+    blocks = blocks_of(np.linspace(0.1, 6.0, 60))
+    found = self_noise(
+        "maximum-likelihood", csm, dims=(3,) * 4, n_effective=40.0, blocks=blocks, n_factors=3
+    )
+    alone = csm[:, live][:, :, live]
+    expected = self_noise(
+        "maximum-likelihood", alone, dims=(2,) * 4, n_effective=40.0, blocks=blocks
+    )
+    np.testing.assert_allclose(found.noise_psd[:, live], expected.noise_psd, rtol=1e-6)
