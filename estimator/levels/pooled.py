@@ -88,7 +88,7 @@ FELT = 0.5
 than that of their motion."""
 CLEARLY = 10.0
 """Such standard deviations, from which a block needs no others to show its weak motion."""
-REACHES = (1, 3, 9, 99)
+REACHES = (1, 3, 9)
 """Blocks to either side with which one looks for weak motion that it does not show clearly."""
 UNSEEN = 0.67
 """Variance of the noise, over that of a PSD, by the square of the motion that does not show: so
