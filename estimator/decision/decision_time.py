@@ -14,6 +14,7 @@ fails where one is above.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -116,14 +117,21 @@ def predict(
             break
     closest = int(np.argmin(np.abs(margins.margin)))
     low, high = (end[[closest]] for end in margins.ends(elapsed / longest, quantile))
+    reached, free = _reached(LIKELY, times, chances), np.zeros(len(margins.margin))
+    is_bounded = False
+    if reached is None and (margins.added + margins.removed).any():
+        by_scatter = replace(margins, added=free, removed=free)
+        limits = {"quantile": quantile, "elapsed": elapsed, "averages": averages, "least": least}
+        is_bounded = predict(by_scatter, **limits).seconds is not None
     return Prediction(
-        seconds=_reached(LIKELY, times, chances),
+        seconds=reached,
         earliest=_reached(EARLY, times, chances),
         latest=_reached(1 - EARLY, times, chances),
         longest=longest,
         resolution_db=float(5 * np.log10(high[0] / low[0])) if low[0] > 0 else math.inf,
         slowest=slowest,
         is_pass=is_pass,
+        is_bounded=is_bounded,
     )
 
 

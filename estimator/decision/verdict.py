@@ -76,6 +76,8 @@ class Prediction:
         Whether it is rather a pass that decides.
     frequency : float
         Centre of the band where it does, in Hz.
+    is_bounded : bool
+        Whether the longest would decide if scatter alone made intervals wide.
     """
 
     seconds: float | None
@@ -86,6 +88,7 @@ class Prediction:
     slowest: int
     is_pass: bool
     frequency: float = math.nan
+    is_bounded: bool = False
 
     @property
     def is_close(self) -> bool:

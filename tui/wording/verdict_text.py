@@ -188,6 +188,11 @@ def record_for(found: TestVerdict) -> str:
             else (f"about {roughly(prediction.seconds)}")
         )
         return f"Record for {long} in all: that decides{_slowest(found)}."
+    if prediction.is_bounded:
+        return (
+            "How long it takes cannot be said: what widens the intervals, beside scatter, is as "
+            "large as the margin."
+        )
     left = ""
     if math.isfinite(prediction.resolution_db):
         left = f" (±{prediction.resolution_db:.2g} dB then)"

@@ -52,7 +52,10 @@ def test_on_the_limit_no_time_is_promised_and_what_is_left_is_said() -> None:
 
 def test_what_clocks_may_have_added_does_not_fail_with_time() -> None:
     assert prediction(-0.2).seconds is not None
-    assert prediction(-0.2, clocks=0.4).seconds is None
+    by_clocks = prediction(-0.2, clocks=0.4)
+    assert by_clocks.seconds is None
+    assert by_clocks.is_bounded  # the noise is not too close to the limit
+    assert not prediction(0.0, cov=0.5, clocks=0.4).is_bounded
     assert prediction(-0.2, can_fail=False).seconds is None
 
 

@@ -88,6 +88,9 @@ def test_what_does_not_end_by_recording_longer_says_so() -> None:
     too_close = replace(CLOSE_TO_IT, prediction=replace(CLOSE_TO_IT.prediction, seconds=None))
     found = remaining(NEVER, too_close, Result(SNAPSHOT, FREE), elapsed=SNAPSHOT.elapsed)
     assert "too close to the limit" in how_long(found, None)
+    bounded = replace(CLOSE_TO_IT.prediction, seconds=None, is_bounded=True)
+    found = replace(found, verdict=replace(too_close, prediction=bounded))
+    assert "cannot be said" in how_long(found, None)
 
 
 def test_a_verdict_that_is_not_sure_ends_only_what_nobody_looks_at() -> None:
