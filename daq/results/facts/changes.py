@@ -145,12 +145,12 @@ class NoiseNotIdentified(Fact):
         where = "" if self.band is None else f" at {span(*self.band)}"
         is_little = self.refusal in {Refusal.SHORT, Refusal.STEADY, Refusal.WIDE}
         return Words(
-            f"Only upper limits{where}: "
-            + ("record while the motion changes by 3 dB" if is_little else "add a third sensor"),
+            f"Only upper limits by multi-part{where}: "
+            + ("record while the motion changes by 3 dB" if is_little else "use three sensors"),
             f"{listed(self.channels)}{where}: {why}. The noise is anywhere below the upper limit.",
             _RECORD_CHANGES
             if is_little
-            else "Add a third sensor, which needs no motion that changes.",
+            else "Use three sensors and another method, which needs no motion that changes.",
         )
 
 
