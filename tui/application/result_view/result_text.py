@@ -93,7 +93,7 @@ def _channels(state: State, result: Result, *, width: int) -> RenderableType:
     title = f"{method}, mean over {band[0]:.3g}–{band[1]:.3g} Hz, dB re 1 ({snapshot.unit})²/Hz"
     is_wide, rows = width >= WIDE, []
     is_full = is_wide or not (margins and differences)
-    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["c.o.v."] if is_full else [])]
+    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["worst c.o.v."] if is_full else [])]
     titles += ["margin, dB", *(["at"] if is_full else [])] if margins else ["from", "to"]
     titles += [f"against {_reference(state)}"] if differences else []
     for column, label in enumerate(snapshot.channels):
