@@ -417,7 +417,9 @@ def _fitted(
         if weak.any():
             A = _leading(shown.motion, shown.number)
             power = (np.abs(_leading(A, weak)) ** 2).sum(axis=1)
-            weakly = np.where(shown.clear >= CLEARLY, _taken(power), weak)
+            weakly = np.where(
+                shown.clear >= CLEARLY, _taken(power, 2 * np.sqrt(p / shown.averages)), weak
+            )
             W = _strongest(Q @ A[own], np.minimum(weak[own], q[own] - n_own))
             Q, U = Q - W @ W.conj().swapaxes(1, 2), np.concatenate([U, W], axis=2)
         rest = without(X, U)
@@ -701,7 +703,7 @@ def _resolved(
     _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
     there = (np.abs(U) ** 2).sum(axis=1)
     along = (U.conj() * (X @ U)).real.sum(axis=1) - there
-    taken = _taken(np.where(there > 0.5, np.maximum(along, OUTSTANDING - 1), 0.0))
+    taken = _taken(np.where(there > 0.5, np.maximum(along, _FLOOR), 0.0), OUTSTANDING - 1)
     lacks = r[here] - n_own
     some = np.logical_or.reduceat(lacks <= 0, parts.first)[here]
     at = np.flatnonzero(some & (lacks > 0))
@@ -713,13 +715,15 @@ def _resolved(
     return U, n_own, taken
 
 
-def _taken(power: FloatArray) -> FloatArray:
+def _taken(power: FloatArray, least: FloatArray | float) -> FloatArray:
     """Return how many averages directions take that are estimated from them, shape (n,).
 
-    `power` is that of the motion over the noise, (n, n_directions); zero where there is none. To
-    first order it is ``sum(1 + 1 / power)`` (Passemier, Li and Yao, JRSS B 79, 2017).
+    `power` is that of the motion over the noise, (n, n_directions), zero where there is none, and
+    counts as `least`, (n,), at least. To first order it is ``sum(1 + 1 / power)`` (Passemier, Li
+    and Yao, JRSS B 79, 2017).
     """
-    return np.asarray(np.where(power > 0, 1 + 1 / np.maximum(power, _FLOOR), 0.0).sum(axis=1))
+    seen = np.maximum(power, np.reshape(least, (-1, 1)))
+    return np.asarray(np.where(power > 0, 1 + 1 / seen, 0.0).sum(axis=1))
 
 
 def _leave_lines(
