@@ -84,6 +84,8 @@ def changes(
 ) -> Iterator[Advice]:
     """Yield advice on changing responses, and on disturbed segments or else on changing noise.
 
+    Of noise, a piece for each band in which it changes, most first; `advise` gives one of them.
+
     Parameters
     ----------
     stability : Stability
@@ -129,19 +131,20 @@ def changes(
     # Within the part of a step, motion is left in the noise of a sensor whose response changes.
     named = np.isin(sensor_of, [each.sensor for each in stability.changes])
     strength = np.where(seen & (more > MATERIAL) & ~named, more, 0.0)
-    if not strength.any():
-        return
-    group, channel = np.unravel_index(int(strength.argmax()), strength.shape)
-    yield NoiseChanges(
-        rank=Rank.DELAYS if strength.max() >= LARGE else Rank.TO_KNOW,
-        sensors=(int(sensor_of[channel]),),
-        band=(float(stability.low[group]), float(stability.high[group])),
-        channel=int(channel),
-        deviation=float(found.deviation[group, channel]),
-        expected=float(found.expected[group, channel]),
-        n_parts=found.n_parts,
-        inflation=float(stability.inflations[group]),
-    )
+    for group in np.argsort(-strength.max(axis=1), kind="stable").tolist():
+        channel = int(strength[group].argmax())
+        if not strength[group, channel]:
+            return
+        yield NoiseChanges(
+            rank=Rank.DELAYS if strength[group, channel] >= LARGE else Rank.TO_KNOW,
+            sensors=(int(sensor_of[channel]),),
+            band=(float(stability.low[group]), float(stability.high[group])),
+            channel=channel,
+            deviation=float(found.deviation[group, channel]),
+            expected=float(found.expected[group, channel]),
+            n_parts=found.n_parts,
+            inflation=float(stability.inflations[group]),
+        )
 
 
 LOST = 0.5

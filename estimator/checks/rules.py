@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, islice
 
 import numpy as np
 
@@ -193,14 +193,22 @@ def advise(
         *_dimensions(bands, alive, n_effective),
         *_weak_motion(bands),
     ]
-    failed = [e for e in others if isinstance(e, advice_on_model.ModelMisfit) and e.is_wrong]
+    misfits = [e for e in others if isinstance(e, advice_on_model.ModelMisfit) and e.is_wrong]
+    failed = [(0.0, nyquist) if e.band is None else e.band for e in misfits]
+    low, high = min((e[0] for e in failed), default=nyquist), max((e[1] for e in failed), default=0)
     found = [
         *_absent(given, dims),
-        # motion that the model lacks is noise to parts of time, and changes as motion does
-        *(
-            each
-            for each in further
-            if not (isinstance(each, NoiseChanges) and any(_overlap(each, e) for e in failed))
+        *(each for each in further if not isinstance(each, NoiseChanges)),
+        # motion that the model lacks is noise to parts of time, and changes as motion does; so
+        # where it fails on both sides
+        *islice(
+            (
+                each
+                for each in further
+                if isinstance(each, NoiseChanges)
+                and (not failed or (each.band is not None and not _within(each.band, low, high)))
+            ),
+            1,
         ),
         *strangers,
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
@@ -214,7 +222,12 @@ def _overlap(one: Advice, other: Advice) -> bool:
     """Return whether the bands of two pieces of advice overlap."""
     if one.band is None or other.band is None:
         return True
-    return one.band[0] <= other.band[1] and other.band[0] <= one.band[1]
+    return _within(one.band, *other.band)
+
+
+def _within(band: tuple[float, float], low: float, high: float) -> bool:
+    """Return whether a band reaches into a span of frequencies."""
+    return band[0] <= high and low <= band[1]
 
 
 def _strangers(
