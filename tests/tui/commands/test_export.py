@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import functools
 import hashlib
 import importlib
 import io
 import json
 import os
+import shutil
 import zlib
 from collections.abc import Callable, Iterator
+from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,18 +27,15 @@ from scipy.io import loadmat
 from typer.testing import CliRunner, Result
 
 import huddle
-from daq.estimation.estimation import estimate
-from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.formats.importer import import_files
 from daq.formats.miniseed_export import export_miniseed
 from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
+from tests import command
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
-from tests.tui import night_recording
 from tui.commands.main import app
-from tui.notebook.curve_files import WRITERS
 from tui.output.exit_codes import ExitCode
 
 BENCH = """
@@ -84,10 +84,63 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def snapshot(recording: Path) -> Snapshot:
-    with Recording.open(recording) as opened:
-        assert opened.bench is not None
-        return estimate([opened], Settings.of(opened.bench))
+def made(recording: Path) -> huddle.Result:
+    return huddle.estimate(recording, segment="5s")
+
+
+@pytest.fixture(scope="module")
+def snapshot(made: huddle.Result) -> Snapshot:
+    return made.snapshot
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Simulate sensors with a limit."""
+    folder = tmp_path_factory.mktemp("simulated")
+    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
+    text = text.replace("sampling_rate = 200.0", "sampling_rate = 50.0")
+    text += '[[limits]]\nname = "low"\nfrequency = [4.0, 18.0]\npsd = [1e-15, 1e-15]\n'
+    (folder / "bench.toml").write_text(text, encoding="utf-8")
+    options = (folder / "bench.toml", "--duration", "40s", "--out", folder / "s.h5")
+    command.huddle("simulate", *options)
+    return folder / "s.h5"
+
+
+@pytest.fixture(scope="module")
+def exported(
+    recording: Path, simulated: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
+    """Return what exports a kind of file once, for tests that only read.
+
+    First it has what simulated sensors measured, and then what takes its place.
+    """
+
+    @functools.cache
+    def export(kind: str) -> Path:
+        path = tmp_path_factory.mktemp(kind) / f"a.{kind}"
+        for source, is_simulated in ((simulated, True), (recording, False)):
+            command.huddle("export", source, "--format", kind, "-o", path, "--segment", "5s")
+            if kind == "uff58":
+                notes = {each["id5"].strip() for each in pyuff.UFF(str(path)).read_sets()}
+                assert notes == {"SIMULATED SENSORS" if is_simulated else "NONE"}
+                continue
+            said = said_by_file(path, kind)
+            found = said["simulated"], said["verdict"]
+            assert found == (("true", "not-decided") if is_simulated else ("false", "none"))
+        return path
+
+    return export
+
+
+@pytest.fixture
+def copy(exported: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Path]:
+    """Return what gives a copy of an exported file, for tests that change it."""
+
+    def copied(kind: str) -> Path:
+        whole = exported(kind).parent
+        return shutil.copytree(whole, tmp_path / "copy") / f"a.{kind}"
+
+    return copied
 
 
 @pytest.mark.usefixtures("needs_obspy")
@@ -243,10 +296,8 @@ def test_files_of_networks_through_import_and_export(tmp_path: Path, name: str) 
         np.testing.assert_array_equal(our.data, their.data)
 
 
-def test_tidy_csv(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
-    out = tmp_path / "a.csv"
-    assert run(recording, "--format", "csv", "-o", out).exit_code == ExitCode.DONE
-    with out.open(encoding="utf-8", newline="") as file:
+def test_tidy_csv(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+    with exported("csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["sensor"] == "rear"]
     (method,) = snapshot.results
     assert {row["method"] for row in rows} == {method}
@@ -259,9 +310,8 @@ def test_tidy_csv(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, expected[np.isfinite(expected)])
 
 
-def test_netcdf(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
-    assert run(recording, "--format", "netcdf", "-o", tmp_path / "a.nc").exit_code == ExitCode.DONE
-    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as found:
+def test_netcdf(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+    with xr.open_dataset(exported("netcdf"), engine="h5netcdf") as found:
         (method,) = snapshot.results
         rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
         np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
@@ -269,10 +319,10 @@ def test_netcdf(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("zarr_threads")
-def test_zarr(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
-    out = tmp_path / "a.zarr"
-    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
-    found = huddle.load(out)
+def test_zarr(
+    exported: Callable[[str], Path], made: huddle.Result, snapshot: Snapshot, tmp_path: Path
+) -> None:
+    found = huddle.load(exported("zarr"))
     (method,) = snapshot.results
     rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
     np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
@@ -281,7 +331,7 @@ def test_zarr(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     own = tmp_path / "mine.zarr"
     (own / "thesis").mkdir(parents=True)
     with pytest.raises(OSError, match="mine"):
-        huddle.estimate(recording).save(own)
+        made.save(own)
     assert [each.name for each in own.iterdir()] == ["thesis"]
 
 
@@ -309,10 +359,9 @@ def _of_a_bomb(folder: Path, about: dict[str, Any]) -> None:
 @pytest.mark.usefixtures("zarr_threads")
 @pytest.mark.parametrize("forged", [_of_pickle, _of_another_packer, _of_huge_shape, _of_a_bomb])
 def test_zarr_from_elsewhere_is_checked_before_it_is_inflated(
-    recording: Path, tmp_path: Path, forged: Callable[[Path, dict[str, Any]], None]
+    copy: Callable[[str], Path], forged: Callable[[Path, dict[str, Any]], None]
 ) -> None:
-    out = tmp_path / "a.zarr"
-    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
+    out = copy("zarr")
     described = json.loads((out / ".zmetadata").read_text(encoding="utf-8"))
     forged(out, described["metadata"]["noise_psd/.zarray"])
     (out / ".zmetadata").write_text(json.dumps(described), encoding="utf-8")
@@ -321,19 +370,17 @@ def test_zarr_from_elsewhere_is_checked_before_it_is_inflated(
 
 
 @pytest.mark.usefixtures("zarr_threads")
-def test_texts_of_zarr_are_no_more_than_they_hold(recording: Path, tmp_path: Path) -> None:
-    out = tmp_path / "a.zarr"
-    assert run(recording, "--format", "zarr", "-o", out).exit_code == ExitCode.DONE
+def test_texts_of_zarr_are_no_more_than_they_hold(copy: Callable[[str], Path]) -> None:
+    out = copy("zarr")
     (out / "channel" / "0").write_bytes(blosc.compress(bytes([0, 0, 0, 40, *range(9)]), b"lz4", 5))
     with pytest.raises(OSError, match=r"channel/0: more than \d+ texts"):
         huddle.load(out)
 
 
 def test_netcdf_from_elsewhere_is_checked_before_it_is_inflated(
-    recording: Path, tmp_path: Path
+    copy: Callable[[str], Path],
 ) -> None:
-    out = tmp_path / "a.nc"
-    assert run(recording, "--format", "netcdf", "-o", out).exit_code == ExitCode.DONE
+    out = copy("netcdf")
     huddle.load(out)
     with h5py.File(out, "r+") as file:
         made = file.create_dataset("x", (9,), "f8", chunks=(9,), compression="gzip")
@@ -347,13 +394,10 @@ def test_netcdf_from_elsewhere_is_checked_before_it_is_inflated(
         huddle.load(out)
 
 
-def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
-    for kind in ("mat", "npz"):
-        out = tmp_path / f"a.{kind}"
-        assert run(recording, "--format", kind, "-o", out).exit_code == ExitCode.DONE
+def test_mat_and_numpy(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
     (method,) = snapshot.results
-    matlab = loadmat(tmp_path / "a.mat")
-    with np.load(tmp_path / "a.npz", allow_pickle=False) as numpy:
+    matlab = loadmat(exported("mat"))
+    with np.load(exported("npz"), allow_pickle=False) as numpy:
         assert numpy["sensors"].tolist() == [label.sensor for label in snapshot.channels]
         for name, expected in (
             ("data_psd", snapshot.data_psd),
@@ -365,10 +409,8 @@ def test_mat_and_numpy(recording: Path, snapshot: Snapshot, tmp_path: Path) -> N
     assert [cell[0].item() for cell in matlab["units"]] == ["(m/s²)²/Hz"] * 6
 
 
-def test_universal_file(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
-    out = tmp_path / "a.uff"
-    assert run(recording, "--format", "uff58", "-o", out).exit_code == ExitCode.DONE
-    sets = pyuff.UFF(str(out)).read_sets()
+def test_universal_file(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+    sets = pyuff.UFF(str(exported("uff58"))).read_sets()
     assert {each["func_type"] for each in sets} == {9}
     (method,) = snapshot.results
     (found,) = [each for each in sets if each["id1"].strip() == f"rear.Y {method} noise_psd"]
@@ -377,11 +419,9 @@ def test_universal_file(recording: Path, snapshot: Snapshot, tmp_path: Path) -> 
     np.testing.assert_allclose(found["x"], snapshot.frequency[2:], rtol=1e-5)
 
 
-def test_parquet(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
+def test_parquet(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is large, and an extra")
-    out = tmp_path / "a.parquet"
-    assert run(recording, "--format", "parquet", "-o", out).exit_code == ExitCode.DONE
-    table = parquet.read_table(out).to_pydict()
+    table = parquet.read_table(exported("parquet")).to_pydict()
     (method,) = snapshot.results
     found = [
         value
@@ -394,14 +434,10 @@ def test_parquet(recording: Path, snapshot: Snapshot, tmp_path: Path) -> None:
     assert set(table["unit"]) == {"m/s²"}
 
 
-READ_TWICE = ("csv", "netcdf", "zarr", "mat", "npz", "parquet")
-"""Formats that two tests write: of sensors, and of simulated ones."""
-
-
-def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
+def said_by_file(path: Path, kind: str) -> dict[str, str]:
     """Return what a file says of what made it, read by a program that is not ours."""
     if kind == "csv":
-        metadata = json.loads((folder / f"{path.name}-metadata.json").read_text(encoding="utf-8"))
+        metadata = json.loads(Path(f"{path}-metadata.json").read_text(encoding="utf-8"))
         assert metadata["url"] == path.name
         return dict(metadata["notes"][0])
     if kind in ("netcdf", "zarr"):
@@ -425,14 +461,13 @@ def said_by_file(folder: Path, kind: str, path: Path) -> dict[str, str]:
 
 
 @pytest.mark.usefixtures("zarr_threads")
-@pytest.mark.parametrize("kind", READ_TWICE)
-def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["csv", "netcdf", "zarr", "mat", "npz", "parquet"])
+def test_every_export_says_what_made_it(
+    recording: Path, exported: Callable[[str], Path], made: huddle.Result, kind: str
+) -> None:
     if kind == "parquet":
         pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
-    path = tmp_path / f"a.{kind}"
-    found = run(recording, "--format", kind, "-o", path, "--segment", "5s")
-    assert found.exit_code == ExitCode.DONE, found.output
-    said = said_by_file(tmp_path, kind, path)
+    said = said_by_file(exported(kind), kind)
     (source,) = json.loads(said["recordings"])
     assert source["sha256"] == hashlib.sha256(recording.read_bytes()).hexdigest()
     assert source["file"] == "a.h5"
@@ -442,65 +477,26 @@ def test_every_export_says_what_made_it(recording: Path, tmp_path: Path, kind: s
     assert said["time_coverage_end"].startswith("2026-11-21T03:01:20")
     assert said["confidence_of_intervals"] == "0.95"
     assert said["unit_of_densities"] == "(m/s²)²/Hz"
-    made = huddle.estimate(recording, segment="5s")
     kinds = [(each["kind"], each["line"]) for each in json.loads(said["facts"])]
     assert kinds == [(each.name, each.words.line) for each in made.result.all_facts]
-    assert said["verdict"] == "none"
-    assert said["simulated"] == "false"
     assert json.loads(said["flags"])["dead_channel"] == 4
-    assert run(recording, "--format", kind, "-o", path).exit_code == ExitCode.DONE  # replaced
 
 
-@pytest.mark.usefixtures("zarr_threads")
-@pytest.mark.parametrize("kind", READ_TWICE)
-def test_exports_of_a_bench_with_limits_say_the_verdict(tmp_path: Path, kind: str) -> None:
-    """A value of an enumeration is no text to h5netcdf."""
-    if kind == "parquet":
-        pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
-    night, path = night_recording.record(tmp_path / "night.h5"), tmp_path / "night.out"
-    found = run(night, "--format", kind, "-o", path)
-    assert found.exit_code == ExitCode.DONE, found.output
-    assert said_by_file(tmp_path, kind, path)["verdict"] == "not-decided"
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("simulated") / "s.h5"
-    command = ["simulate", "fig4", "--duration", "40s", "--out", str(path)]
-    assert CliRunner().invoke(app, command).exit_code == ExitCode.DONE
-    return path
-
-
-@pytest.mark.usefixtures("zarr_threads")
-@pytest.mark.parametrize("kind", [*WRITERS, "estimate --csv"])
-def test_every_export_says_whether_sensors_were_simulated(
-    recording: Path, simulated: Path, tmp_path: Path, kind: str
+def test_a_table_of_an_estimate_says_whether_sensors_were_simulated(
+    recording: Path, simulated: Path, tmp_path: Path
 ) -> None:
-    if kind == "parquet":
-        pytest.importorskip("pyarrow", reason="pyarrow is large, and an extra")
-    sources = {simulated: "true"} if kind in READ_TWICE else {simulated: "true", recording: "false"}
-    for source, wanted in sources.items():
-        path = tmp_path / f"{source.stem}.out"
-        if kind == "estimate --csv":
-            options = ["estimate", source, "--segment", "5s", "--csv", path]
-            found = CliRunner().invoke(app, list(map(str, options)))
-        else:
-            found = run(source, "--format", kind, "-o", path, "--segment", "5s")
-        assert found.exit_code == ExitCode.DONE, found.output
-        if kind == "uff58":
-            notes = {each["id5"].strip() for each in pyuff.UFF(str(path)).read_sets()}
-            assert notes == {"SIMULATED SENSORS" if source is simulated else "NONE"}
-        else:
-            form = "csv" if kind == "estimate --csv" else kind
-            assert said_by_file(tmp_path, form, path)["simulated"] == wanted
+    for source, code, said in ((simulated, 4, "true"), (recording, 0, "false")):
+        path = tmp_path / f"{source.stem}.csv"
+        command.huddle("estimate", source, "--segment", "5s", "--csv", path, code=code)
+        assert said_by_file(path, "csv")["simulated"] == said
 
 
 def test_a_table_on_standard_output_leaves_no_metadata(
-    simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for place in ("-", os.devnull):
-        options = ["estimate", str(simulated), "--segment", "5s", "--csv", place]
+        options = ["estimate", str(recording), "--segment", "5s", "--csv", place]
         assert CliRunner().invoke(app, options).exit_code == ExitCode.DONE
     assert not list(tmp_path.iterdir())
     assert not Path(f"{os.devnull}-metadata.json").exists()
