@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import import_module
 from itertools import chain
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rich.table import Table
 from typer.testing import CliRunner
 
@@ -39,6 +41,21 @@ def modules_after(code: str) -> set[str]:
     code += "; import sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+def samples(names: Iterable[str] = "ABC", n_channels: int = 3) -> dict[str, NDArray[np.float64]]:
+    """Return 60 s of sensors with a common motion."""
+    rng = np.random.default_rng(5)
+    motion = rng.normal(size=(6000, n_channels))
+    return {name: motion + 0.1 * rng.normal(size=motion.shape) for name in names}
+
+
+def imported(tmp_path: Path, sensors: Mapping[str, NDArray[np.float64]] | None = None) -> Path:
+    """Return a recording of samples."""
+    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
+    np.savez(source, sampling_rate=100.0, **(sensors or samples()))  # type: ignore[arg-type]  # names of arrays
+    printed("import", str(source), "--out", str(out))
+    return out
 
 
 # ------------------------------------------------------------------------------ help
@@ -65,13 +82,6 @@ def test_help_loads_nothing_that_takes_long(arguments: list[str]) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help_with_examples(name: str) -> None:
-    text = printed(name, "--help")
-    assert "Examples" in text
-    assert f"huddle {name} " in text or f"huddle {name}\n" in text
-
-
 def test_help_is_whole_where_python_drops_docstrings() -> None:
     run = [sys.executable, "-OO", "-m", "huddle", "run", "--help-all"]
     shown = subprocess.run(run, capture_output=True, text=True, check=True).stdout
@@ -80,8 +90,10 @@ def test_help_is_whole_where_python_drops_docstrings() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_shows_what_is_needed_first_and_help_all_the_rest(name: str) -> None:
+def test_help_has_examples_and_what_is_needed_first_and_help_all_the_rest(name: str) -> None:
     short, whole = printed(name, "--help"), printed(name, "--help-all")
+    assert "Examples" in short
+    assert f"huddle {name} " in short or f"huddle {name}\n" in short
     options = re.findall(r"^  (?:-\w, )?(--[\w-]+)", short, re.MULTILINE)
     assert len(set(options) - {"--help", "--help-all"}) <= 10
     assert {*options} - {"--help-all"} <= {
@@ -204,45 +216,10 @@ def test_help_names_every_study_and_scenario() -> None:
     assert set(SCENARIOS) <= said["simulate"]
 
 
-def test_help_loads_neither_arrays_nor_screens() -> None:
-    loaded = modules_after("import tui.commands.main")
-    assert not loaded & {"numpy", "scipy", "h5py", "textual", "pydantic", "serial", "matplotlib"}
-
-
-def test_an_estimate_loads_no_more_than_it_needs(tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    motion = rng.normal(size=(6000, 3))
-    sensors = {name: motion + 0.1 * rng.normal(size=(6000, 3)) for name in "ABC"}
-    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
-    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    printed("import", str(source), "--out", str(out))
-    loaded = modules_after(
-        "import contextlib, io, tui.commands.main as command\n"
-        "with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):"
-        f" command.main(['estimate', {str(out)!r}, '--segment', '1s'])\n0"
-    )
-    assert "estimator.checks.diagnose" in loaded
-    unwanted = {
-        "pydantic",
-        "daq.bench.model",
-        "daq.bench.response",
-        "daq.results.decision.limits",
-        "tui.output.json_document",
-        "importlib.metadata",
-        "scipy",
-        "numpy.polynomial",
-        "matplotlib",
-        "textual",
-        "tomlkit",
-        "serial",
-    }
-    assert not loaded & unwanted
-
-
 @pytest.mark.parametrize(
     "scenario", ["fig9", pytest.param("tui/resources/demo.toml", marks=pytest.mark.long)]
 )
-def test_an_estimate_loads_no_masked_arrays(scenario: str, tmp_path: Path) -> None:
+def test_an_estimate_loads_no_more_than_it_needs(scenario: str, tmp_path: Path) -> None:
     """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
     path = tmp_path / "short.h5"
     named = str(ROOT / scenario) if scenario.endswith(".toml") else scenario
@@ -251,8 +228,12 @@ def test_an_estimate_loads_no_masked_arrays(scenario: str, tmp_path: Path) -> No
     loaded = modules_after(
         f"from tui.commands.main import main\ntry:\n    {run}\nexcept SystemExit:\n    print()"
     )
-    assert "daq.estimation.estimation" in loaded
-    assert not loaded & {"numpy.ma", "numpy.random", "numpy.polynomial", "scipy"}
+    assert {"daq.estimation.estimation", "estimator.checks.diagnose"} <= loaded
+    assert not loaded & {
+        "daq.bench.model", "daq.bench.response", "daq.results.decision.limits",
+        "importlib.metadata", "matplotlib", "numpy.ma", "numpy.polynomial", "numpy.random",
+        "pydantic", "scipy", "serial", "textual", "tomlkit", "tui.output.json_document",
+    }  # fmt: skip
 
 
 def test_only_given_options_are_converted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,12 +280,10 @@ def test_a_report_without_matplotlib_names_the_extra_before_anything_is_estimate
 
 def test_names_with_punctuation_are_printed_as_they_are(tmp_path: Path) -> None:
     """Neither markup nor emoji, and never taken apart: brackets, colons, dots, spaces."""
-    rng = np.random.default_rng(5)
-    motion = rng.normal(size=(6000, 3))
     names = ("rack:1", "[red]rack:2", "a. b :x:")
-    sensors = {name: motion + 0.1 * rng.normal(size=(6000, 3)) for name in names}
-    sensors[names[1]][:, 2] *= -1
     source, out = tmp_path / "a.npz", tmp_path / "[b]a.h5"
+    sensors = samples(names)
+    sensors[names[1]][:, 2] *= -1
     np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
     assert f"{out} written" in "".join(
         printed("import", str(source), "--out", str(out)).split("\n")
@@ -362,30 +341,15 @@ def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["estimate", "report"])
 def test_no_estimate_is_exit_3_and_says_what_is_wrong(tmp_path: Path, command: str) -> None:
-    rng = np.random.default_rng(5)
-    motion = rng.normal(size=(4000, 1))
-    sensors = {name: motion + 0.1 * rng.normal(size=(4000, 1)) for name in ("r:1", "r:2", "r:3")}
+    sensors = samples(("r:1", "r:2", "r:3"), 1)
     sensors["r:2"] = sensors["r:1"]
-    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
-    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    printed("import", str(source), "--out", str(out))
+    out = imported(tmp_path, sensors)
     options = ("--method", "three-sensor", "--segment", "1s")
     result = huddle(command, str(out), *options, code=3)
     assert "no channel's noise can be estimated at any frequency by three-sensor" in result.stderr
     assert re.search(r"r:2\.\S+ repeats r:1\.\S+, sample for sample", result.stderr)
     assert "One signal is connected or named twice" in result.stderr
     assert all(line.startswith("huddle: ") for line in result.stderr.splitlines())
-
-
-def imported(tmp_path: Path) -> Path:
-    """Three sensors with a common motion, as a recording."""
-    rng = np.random.default_rng(5)
-    motion = rng.normal(size=(4000, 2))
-    sensors = {name: motion + 0.1 * rng.normal(size=(4000, 2)) for name in "ABC"}
-    source, out = tmp_path / "a.npz", tmp_path / "a.h5"
-    np.savez(source, sampling_rate=100.0, **sensors)  # type: ignore[arg-type]  # names of arrays
-    printed("import", str(source), "--out", str(out))
-    return out
 
 
 def test_noise_parameters_on_request(tmp_path: Path) -> None:
