@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import pytest
 
@@ -20,6 +21,20 @@ def empty_figures() -> Iterator[None]:
     """Leave figures empty: curves take most of a certificate's time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def short_pages() -> Iterator[None]:
+    """Leave sections out of certificates: to set them takes most of the time of their tests."""
+    kept = {"Result", "Laboratory, customer and test"}
+
+    def written(report: Report, file: BinaryIO, **options: Any) -> None:  # noqa: ANN401
+        sections = tuple(each for each in report.sections if each.title in kept)
+        write_paper(replace(report, sections=sections), file, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tui.certificate.issuing.write_paper", written)
         yield
 
 

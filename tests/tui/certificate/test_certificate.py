@@ -37,6 +37,7 @@ from tui.commands.main import app
 from tui.page.blocks import Report
 from tui.service.records.store import NAME as RUNS
 
+pytestmark = pytest.mark.usefixtures("short_pages")
 NAMESPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 
 CHECKLIST: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {

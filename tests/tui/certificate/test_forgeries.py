@@ -35,6 +35,8 @@ from tui.certificate.signing import PdfSignature, Signer, signatures
 from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
 from tui.commands.main import app
 
+pytestmark = pytest.mark.usefixtures("short_pages")
+
 
 def bomb(n: int) -> bytes:
     """Return a PDF with n results, each of which becomes 64 MB."""
