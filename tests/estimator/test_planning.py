@@ -56,11 +56,11 @@ def test_estimates_have_the_planned_precision(method: str) -> None:
     plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 3, 3), settings=PAPER, cov=0.2)}
     for channel in (0, 8):
         n = round(plans[method].n_effective[0, channel])
-        sample = wishart(csm[0], n, rng, n_draws=1500)
+        sample = wishart(csm[0], n, rng, n_draws=700)
         found = self_noise(method, sample, dims=(3, 3, 3), n_effective=n)
         relative = found.noise_psd[:, channel] / noise_psd[0, channel]
-        # 1.8 % standard error of the deviation; the delta method itself is good to order 1/n
-        assert relative.std() == pytest.approx(0.2, rel=0.08)
+        # 2.7 % standard error of the deviation; the delta method itself is good to order 1/n
+        assert relative.std() == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.long

@@ -82,7 +82,7 @@ def test_a_result_names_when_the_clock_of_a_text_logger_was_set(
             receive = decoder.receive_datagram
         else:
             rows = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
-            decoder, sent = TextDecoder(name, rows, sampling_rate=RATE), logger.rows()
+            decoder, sent = TextDecoder(name, rows, sampling_rate=RATE), logger.rows(0.5)
             receive = decoder.receive
         for data, seconds in sent:
             items += receive(data, arrival(seconds))

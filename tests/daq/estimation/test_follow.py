@@ -164,7 +164,7 @@ async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recor
         return {"sensors": {}}
 
     async with serve(answer) as address:
-        grows = known_clocks.growing(path, scene, every=20.0, control=address)
+        grows = known_clocks.growing(path, scene, every=50.0, control=address)
         next(grows)
         noted = Noted(cancelled=Goes(lambda: next(grows, None)))
         process = Process(lambda: next(grows, None))

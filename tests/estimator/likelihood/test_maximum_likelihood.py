@@ -243,7 +243,7 @@ def test_the_estimate_is_unbiased_with_the_scatter_of_the_bound(
     A sample c.o.v. of m draws scatters by 1/sqrt(2 m) (more for the skewed: 1.5 allows it),
     the mean by cov/sqrt(m), coverage by sqrt(.05 .95/m).
     """
-    n_draws = 600
+    n_draws = 300 if n_averages == 100 else 600
     csm, noise_psd, dims = GEOMETRIES[geometry]
     bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=n_averages, dims=dims)[0]
     draws = wishart(csm, n_averages, np.random.default_rng(n_averages), n_draws=n_draws)

@@ -32,17 +32,17 @@ def test_two_poor_sensors_hardly_affect_the_others(ratio: float, snr: float, n: 
     noise_psd = two_poor_sensors(ratio)
     rng = np.random.default_rng(4)
     csm = random_bench(rng, dims=FIVE, snr=snr, noise_psd=noise_psd)
-    sample = wishart(csm, n, rng, n_draws=800)
+    sample = wishart(csm, n, rng, n_draws=400)
     found = three_sensor(sample, dims=FIVE, n_effective=n)
     best = self_noise("maximum-likelihood", sample, dims=FIVE, n_effective=n)
     relative = found.noise_psd / noise_psd
     error = relative.std(axis=0) / np.sqrt(len(sample))
     assert np.all(np.abs(relative.mean(axis=0) - 1) < 4.5 * error)
     scatter, least = (each.noise_psd[:, GOOD].std(axis=0).mean() for each in (found, best))
-    # the mean of nine standard deviations of 800 draws: below 1.6 % standard error of their ratio
+    # the mean of nine standard deviations of 400 draws: below 2.3 % standard error of their ratio
     assert scatter < 1.1 * least
     predicted = np.median(found.cov * np.abs(found.noise_psd) / noise_psd, axis=0)
-    np.testing.assert_allclose(predicted, relative.std(axis=0), rtol=0.1 + 1 / n)  # 4 / √(2 · 800)
+    np.testing.assert_allclose(predicted, relative.std(axis=0), rtol=0.14 + 1 / n)  # 4 / √(2 · 400)
     covers = (found.low < noise_psd) & (noise_psd < found.high)
     assert 0.93 < covers.mean() < 0.97
 
