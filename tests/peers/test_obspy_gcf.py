@@ -24,6 +24,7 @@ from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.world.world import World
 from tests.daq.devices.reading import record
 from tests.sim_devices.simulated_bench import scenario
+from tests.tcp import served
 
 pytestmark = pytest.mark.peer
 
@@ -164,28 +165,24 @@ def frames(tmp_path: Path) -> list[bytes]:
 async def test_our_driver_reads_what_obspy_wrote(frames: list[bytes]) -> None:
     """Over a real connection, each frame sent when the one before was acknowledged."""
     counts = np.random.default_rng(7).integers(-9000, 9000, (2000, 3))
-    tasks: list[asyncio.Task[None] | None] = []
     replies = bytearray()
 
     async def send(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
         for frame in frames:
             writer.write(frame)
             replies.extend(await reader.read(6))
         await reader.read()
-        writer.close()
 
-    async with await asyncio.start_server(send, "127.0.0.1", 0) as server:
+    async with served(send) as number:
         sensor = Sensor(
             name="A",
             driver="guralp",
-            port=f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}",
+            port=f"socket://127.0.0.1:{number}",
             sampling_rate=100.0,
             settings={"streams": STREAMS},
             channels=tuple(Channel(name=name, sensitivity=1.0) for name in "ZNE"),
         )
         blocks, events = await record(driver_type("guralp"), sensor, 2000)
-        await asyncio.gather(*filter(None, tasks))
     assert not events
     np.testing.assert_array_equal(np.concatenate([b.counts for b in blocks]), counts)
     assert blocks[0].device_counter == START * 10**9

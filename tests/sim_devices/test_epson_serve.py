@@ -21,6 +21,7 @@ from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.devices import device_at, host_clock, paced_clock, serving
 from tests.sim_devices.simulated_bench import AXES, device, scenario, sensors, spec
+from tests.tcp import served
 
 pytestmark = pytest.mark.devices
 
@@ -119,7 +120,6 @@ async def test_a_corrupted_serial_number_is_not_accepted(
 
     async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         nonlocal changed
-        tasks.append(asyncio.current_task())
         from_device, to_device = await asyncio.open_connection(host, int(number))
 
         async def back() -> None:
@@ -137,15 +137,11 @@ async def test_a_corrupted_serial_number_is_not_accepted(
                 to_device.write(received)
         to_device.close()
         await returning
-        writer.close()
 
-    tasks: list[asyncio.Task[None] | None] = []
-    async with await asyncio.start_server(relay, "127.0.0.1", 0) as server:
-        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        (sensor,) = sensors(running[2], TABLES[2], port=port)
+    async with served(relay) as own:
+        (sensor,) = sensors(running[2], TABLES[2], port=f"socket://127.0.0.1:{own}")
         async with DRIVER.open([sensor], host_clock(SPEED)) as session:
             (information,) = session.information
-        await asyncio.gather(*filter(None, tasks))
     assert changed
     assert information.serial_number == "C0000007"
 
@@ -186,19 +182,14 @@ async def test_other_rates_and_fields_are_recorded(running: tuple[RunningDevice,
 
 
 async def test_silence_and_other_devices_are_distinguished() -> None:
-    tasks: list[asyncio.Task[None] | None] = []
-
     async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
-        with contextlib.suppress(ConnectionError):  # closed before it had read all
-            while await reader.read(64):
-                if talks:
-                    writer.write(b"login: ")
-        writer.close()
+        while await reader.read(64):
+            if talks:
+                writer.write(b"login: ")
 
     talks = False
-    async with await asyncio.start_server(stranger, "127.0.0.1", 0) as server:
-        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with served(stranger) as number:
+        port = f"socket://127.0.0.1:{number}"
         table = device("A")
         quiet = device_at(port, "A", "epson")
         (sensor,) = sensors(quiet, table)
@@ -207,7 +198,6 @@ async def test_silence_and_other_devices_are_distinguished() -> None:
         talks = True
         with pytest.raises(WrongDeviceError, match=r"not an Epson .* got 6c 6f 67 69 6e 3a 20"):
             await blocks(sensor, 1)
-        await asyncio.gather(*filter(None, tasks))
 
 
 def test_a_spec_that_cannot_be_served_is_refused_with_its_cause() -> None:

@@ -29,6 +29,7 @@ from sim_devices.devices.iio import Iiod
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
 from tests.sim_devices.simulated_bench import device, scenario
+from tests.tcp import served
 from tests.waiting import limit, wait_until
 
 pytestmark = pytest.mark.peer
@@ -50,28 +51,24 @@ def sampled(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
 async def serving() -> AsyncIterator[str]:
     """Serve the simulated board; yield its URI."""
     source, loop = Source(scenario("A"), SPEC), asyncio.get_running_loop()
-    began, tasks = loop.time() - 5.0, set()
+    began = loop.time() - 5.0
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.add(asyncio.current_task())
         iiod = Iiod(SPEC, source)
         iiod.connected(loop.time() - began)
-        with contextlib.suppress(ConnectionError):
-            while True:
-                received = b""
-                wait = min(1.0, max(0.0, iiod.next_due() - (loop.time() - began)))
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(wait):
-                        received = await reader.read(4096)
-                        if not received:
-                            break
-                for unit in iiod.receive(received, loop.time() - began):
-                    writer.write(unit)
-        writer.close()
+        while True:
+            received = b""
+            wait = min(1.0, max(0.0, iiod.next_due() - (loop.time() - began)))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait):
+                    received = await reader.read(4096)
+                    if not received:
+                        break
+            for unit in iiod.receive(received, loop.time() - began):
+                writer.write(unit)
 
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        yield f"ip:127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    await asyncio.gather(*filter(None, tasks))
+    async with served(serve) as number:
+        yield f"ip:127.0.0.1:{number}"
 
 
 async def _run(*command: str) -> bytes:

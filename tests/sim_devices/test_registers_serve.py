@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -23,6 +22,7 @@ from daq.protocols.block import Block, BlockFlag, Event
 from sim_devices.server.launch import RunningDevice
 from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
+from tests.tcp import served
 
 pytestmark = pytest.mark.devices
 
@@ -235,25 +235,21 @@ async def test_a_bus_is_opened_again_without_a_silent_slave(
 
 async def test_replies_of_other_units_and_short_ones_are_counted() -> None:
     """A slave that answers in turn as it should, as another unit, too shortly, and not at all."""
-    tasks: list[asyncio.Task[None] | None] = []
 
     async def slave(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
         n = 0
-        with contextlib.suppress(ConnectionError):
-            while len(await reader.read(64)) >= 8:
-                values = np.arange(1 if n % 5 == 3 else 3, dtype=np.uint16) + n
-                answers = [
-                    rtu.encode_registers(7 if n % 5 == 2 else 1, 3, values),
-                    rtu.encode_exception(1, 3, 4),
-                    rtu.encode(1, bytes([3, 255]) + bytes(9)),
-                ]
-                writer.write(answers[{4: 1, 5: 2}.get(n % 6, 0)])
-                n += 1
-        writer.close()
+        while len(await reader.read(64)) >= 8:
+            values = np.arange(1 if n % 5 == 3 else 3, dtype=np.uint16) + n
+            answers = [
+                rtu.encode_registers(7 if n % 5 == 2 else 1, 3, values),
+                rtu.encode_exception(1, 3, 4),
+                rtu.encode(1, bytes([3, 255]) + bytes(9)),
+            ]
+            writer.write(answers[{4: 1, 5: 2}.get(n % 6, 0)])
+            n += 1
 
-    async with await asyncio.start_server(slave, "127.0.0.1", 0) as server:
-        port = f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with served(slave) as number:
+        port = f"socket://127.0.0.1:{number}"
         table = device("A", "registers", sampling_rate=20.0, channels={"A": CHANNELS})
         here = device_at(port, "A", "registers")
         (sensor,) = sensors(here, table, settings={"address": 0, "timeout": 0.1})
@@ -264,7 +260,6 @@ async def test_replies_of_other_units_and_short_ones_are_counted() -> None:
                     events.append(f"{item.kind}: {item.text}")
                 if len(events) >= 30:
                     break
-    await asyncio.gather(*filter(None, tasks))
     for said in (
         "stalled: .*; received a reply of unit 7, expected unit 1 (1 so far)",
         "checksum: .*; received 14 bytes that are no reply (",

@@ -24,6 +24,7 @@ from sim_devices.server.launch import RunningDevice
 from tests.daq.devices import reading
 from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
+from tests.tcp import served
 
 pytestmark = pytest.mark.devices
 
@@ -151,11 +152,9 @@ async def test_an_absent_server_is_reported() -> None:
 async def sending(streams: Sequence[str], n_blocks: int) -> AsyncIterator[str]:
     """Yield the port of a Scream server that sends so many blocks of each stream, and no more."""
     ended = asyncio.Event()
-    tasks: list[asyncio.Task[None] | None] = []
     begin_ns = 1_700_000_000 * 10**9
 
     async def send(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
         assert await reader.read(1) == scream.TCP_SEND
         for k in range(n_blocks * len(streams)):
             number = k // len(streams)
@@ -169,12 +168,10 @@ async def sending(streams: Sequence[str], n_blocks: int) -> AsyncIterator[str]:
             )
             writer.write(scream.encode_packet(scream.Packet(k, "test", block)))
         await ended.wait()
-        writer.close()
 
-    async with await asyncio.start_server(send, "127.0.0.1", 0) as server:
-        yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with served(send) as number:
+        yield f"socket://127.0.0.1:{number}"
         ended.set()
-    await asyncio.gather(*filter(None, tasks))
 
 
 @pytest.mark.parametrize("named", [False, True])
@@ -197,12 +194,10 @@ async def test_blocks_received_during_discovery_are_not_lost(named: bool) -> Non
 @contextlib.asynccontextmanager
 async def unreliable(target: int, n_refused: int) -> AsyncIterator[int]:
     """Yield a TCP port that closes the first connections and passes the others on."""
-    tasks: list[asyncio.Task[None] | None] = []
     left = n_refused
 
     async def pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         nonlocal left
-        tasks.append(asyncio.current_task())
         left -= 1
         if left < 0:
             there, here = await asyncio.open_connection("127.0.0.1", target)
@@ -211,11 +206,9 @@ async def unreliable(target: int, n_refused: int) -> AsyncIterator[int]:
                     here.write(asked)
                     writer.write(await there.read(1100))
             here.close()
-        writer.close()
 
-    async with await asyncio.start_server(pass_on, "127.0.0.1", 0) as server:
-        yield server.sockets[0].getsockname()[1]
-    await asyncio.gather(*filter(None, tasks))
+    async with served(pass_on) as number:
+        yield number
 
 
 async def test_failed_recovery_is_repeated() -> None:

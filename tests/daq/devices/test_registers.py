@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -20,6 +21,7 @@ from daq.devices.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
 from tests.devices import host_clock
+from tests.tcp import served
 
 pytestmark = pytest.mark.virtual_time
 
@@ -30,22 +32,15 @@ DRIVER = driver_type("registers")
 @contextlib.asynccontextmanager
 async def slave(answer: Callable[[int, bytes], bytes]) -> AsyncIterator[str]:
     """Serve a slave that answers its n-th request, of eight bytes; yield its port."""
-    tasks: list[asyncio.Task[None] | None] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
-        n = 0
-        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
-            while True:
-                request = await reader.readexactly(8)
-                await asyncio.sleep(0.005)  # the line
-                writer.write(answer(n, request))
-                n += 1
-        writer.close()
+        for n in itertools.count():
+            request = await reader.readexactly(8)
+            await asyncio.sleep(0.005)  # the line
+            writer.write(answer(n, request))
 
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    await asyncio.gather(*filter(None, tasks))
+    async with served(serve) as number:
+        yield f"socket://127.0.0.1:{number}"
 
 
 def reply(n: int, *, unit: int = 1) -> bytes:
@@ -145,20 +140,15 @@ class SlowSlave:
     @contextlib.asynccontextmanager
     async def serve(self) -> AsyncIterator[str]:
         """Serve; yield the port."""
-        tasks: list[asyncio.Task[None] | None] = []
 
         async def answered(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            tasks.append(asyncio.current_task())
-            with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
-                while True:
-                    request = await reader.readexactly(8)
-                    await asyncio.sleep(0.002)
-                    writer.write(await self._reply(request))
-            writer.close()
+            while True:
+                request = await reader.readexactly(8)
+                await asyncio.sleep(0.002)
+                writer.write(await self._reply(request))
 
-        async with await asyncio.start_server(answered, "127.0.0.1", 0) as server:
-            yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        await asyncio.gather(*filter(None, tasks))
+        async with served(answered) as number:
+            yield f"socket://127.0.0.1:{number}"
 
     async def _reply(self, request: bytes) -> bytes:
         count = int.from_bytes(request[4:6], "big")
@@ -232,29 +222,24 @@ async def test_numbers_of_requests_may_wrap_over_tcp(monkeypatch: pytest.MonkeyP
     begun = TransactionManager.callback_connected
     monkeypatch.setattr(TransactionManager, "callback_connected", connected)
     numbers: list[int] = []
-    ended = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         before = b""
-        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
-            while True:
-                number, _, _, unit, function, _, n_words = struct.unpack(
-                    ">HHHBBHH", await reader.readexactly(12)
-                )
-                words = np.arange(len(numbers), len(numbers) + n_words, dtype=">u2").tobytes()
-                pdu = struct.pack(">BBB", unit, function, len(words)) + words
-                answer = struct.pack(">HHH", number, 0, len(pdu)) + pdu
-                numbers.append(number)
-                writer.write(before + answer)
-                before = answer
-        writer.close()
-        ended.set()
+        while True:
+            number, _, _, unit, function, _, n_words = struct.unpack(
+                ">HHHBBHH", await reader.readexactly(12)
+            )
+            words = np.arange(len(numbers), len(numbers) + n_words, dtype=">u2").tobytes()
+            pdu = struct.pack(">BBB", unit, function, len(words)) + words
+            answer = struct.pack(">HHH", number, 0, len(pdu)) + pdu
+            numbers.append(number)
+            writer.write(before + answer)
+            before = answer
 
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        port = f"modbus-tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with served(serve) as tcp:
+        port = f"modbus-tcp://127.0.0.1:{tcp}"
         async with open_bus(port, host_clock(), label="A") as bus:
             for n in range(50):
                 answer = await bus.read(3, 1, 0, 2)
                 assert answer.registers == [n, n + 1]
-        await ended.wait()
     assert numbers == [*range(64_981, 65_001), *range(1, 31)]

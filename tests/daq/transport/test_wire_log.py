@@ -14,23 +14,19 @@ from daq.errors import NotConnectedError, ReplayError
 from daq.host_clock import SystemClock
 from daq.transport.ports import open_port
 from daq.transport.wire_log import Replay, logging_to, session_ends, using
+from tests.tcp import served
 
 
 @contextlib.asynccontextmanager
 async def echo() -> AsyncIterator[str]:
     """Serve a port that answers each line; yield its address."""
-    tasks: list[asyncio.Task[None] | None] = []
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        tasks.append(asyncio.current_task())
-        with contextlib.suppress(ConnectionError):
-            while line := await reader.readline():
-                writer.write(b"you said " + line)
-        writer.close()
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while line := await reader.readline():
+            writer.write(b"you said " + line)
 
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        yield f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}"
-    await asyncio.gather(*filter(None, tasks))
+    async with served(answer) as number:
+        yield f"socket://127.0.0.1:{number}"
 
 
 async def talk(port: str, *lines: bytes) -> list[tuple[bytes, int]]:

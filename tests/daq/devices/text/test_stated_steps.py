@@ -22,6 +22,7 @@ from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
+from tests.tcp import served
 
 ROWS = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
 SIZES = [0.02, 0.3, 1.0, 3600.0]
@@ -120,14 +121,13 @@ async def test_a_row_that_begins_a_jump_before_a_hang_up_is_recorded() -> None:
     async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         rows = [f"{n / 100 + 9 * (n == 299):.2f},{n}\n" for n in range(300)]
         writer.write("".join(rows).encode())
-        writer.close()
 
     numbers: list[int] = []
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+    async with served(serve) as number:
         one = Sensor(
             name="A",
             driver="text",
-            port=f"socket://127.0.0.1:{server.sockets[0].getsockname()[1]}",
+            port=f"socket://127.0.0.1:{number}",
             sampling_rate=100.0,
             channels=(Channel(name="X", sensitivity=1.0),),
             settings={"columns": [1], "time_column": 0},
