@@ -30,6 +30,7 @@ from tests.torture.power_cuts import MODELS, faults, recorded, shim
 from tests.torture.service_database import database_faults
 from tests.torture.service_kills import RATE, soak
 from tests.torture.starved_recorder import starved_faults
+from tests.tui.demo_bench import demo_devices
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation" / "torture.md"
 KILLS, CUTS, DISK_ERRORS = 300, 100, 50
@@ -144,7 +145,7 @@ def _faults(share: float, folder: Path) -> Iterator[Row]:
         return
     (folder / "inputs").mkdir()
     with (
-        fault_commands.devices(folder / "inputs") as bench,
+        demo_devices(folder / "inputs", speed=fault_commands.SPEED) as bench,
         FaultyDisk(built, folder) as disk,
     ):
         made = fault_commands.commands(folder / "inputs")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
@@ -10,9 +9,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +21,7 @@ from scipy.io import loadmat
 
 from daq.bench.loading import dump
 from daq.bench.tables.unattended import Schedule, ScheduledRun
-from daq.devices.bench_file import load, parse
+from daq.devices.bench_file import load
 from daq.errors import RecordingError
 from daq.estimation.estimation import estimate
 from daq.recording.reader import Recording
@@ -38,9 +36,8 @@ from tui.certificate.ledger import Ledger
 from tui.certificate.verification import JSON_NAME
 from tui.service.records.run_state import RunState
 from tui.service.records.store import RunStore
-from tui.simulation.devices import simulated
 
-_SPEED = 8.0
+SPEED = 8.0
 """Of the simulated devices, in times real time."""
 
 
@@ -164,16 +161,6 @@ def commands(inputs: Path) -> dict[str, Command]:
         ),
     ]
     return {each.name: each for each in made}
-
-
-@contextlib.contextmanager
-def devices(folder: Path) -> Iterator[Path]:
-    """Yield a bench file, in a folder, that reaches three simulated accelerometers."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    path = folder / "bench.toml"
-    with simulated(parse(text), speed=_SPEED) as reachable:
-        path.write_text(dump(reachable), encoding="utf-8")
-        yield path
 
 
 def device_commands(bench: Path) -> dict[str, Command]:

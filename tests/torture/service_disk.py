@@ -18,7 +18,6 @@ import tempfile
 import time
 from collections import Counter
 from datetime import timedelta
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +28,7 @@ from daq.devices.bench_file import parse
 from tests.torture.power_cuts import shim
 from tests.torture.service_kills import BEGIN, faults
 from tests.torture.service_program import FastClock
+from tests.tui.demo_bench import DEMO
 from tui.service.records.run_state import UNFINISHED, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
@@ -45,7 +45,6 @@ def main() -> int:
     n_episodes = int(sys.argv[1]) if len(sys.argv) > 1 else 30
     rate = float(sys.argv[2]) if len(sys.argv) > 2 else 10.0
     rng = np.random.default_rng(1)
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     struck, wrong = Counter[str](), []
     with tempfile.TemporaryDirectory(prefix="huddle-disk-") as name:
         folder = Path(name)
@@ -55,7 +54,7 @@ def main() -> int:
             return 2
         disk.mkdir()
         store, log = RunStore(disk), folder / "service.log"
-        with simulated(parse(text), speed=rate) as reachable:
+        with simulated(parse(DEMO), speed=rate) as reachable:
             path = folder / "bench.toml"
             changes = {
                 "schedule": Schedule(runs=(ENTRY,)),

@@ -24,7 +24,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from importlib import resources
 from itertools import takewhile
 from pathlib import Path
 
@@ -39,6 +38,7 @@ from daq.python_process import python_command
 from daq.recorder.schedule import due_times
 from tests.torture.service_checks import fault_of_recording, faults_of_results
 from tests.torture.service_program import FastClock
+from tests.tui.demo_bench import DEMO
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
@@ -264,10 +264,9 @@ def soak(
     calm: float = 0.0,
 ) -> tuple[list[str], list[str]]:
     """Serve for a while; return what is wrong, and what came of the runs and the memory."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory(prefix="huddle-soak-") as name:
         folder = Path(name)
-        with simulated(with_pulled_cables(parse(text)), speed=rate) as reachable:
+        with simulated(with_pulled_cables(parse(DEMO)), speed=rate) as reachable:
             changes = {
                 "schedule": Schedule(runs=(ENTRY,)),
                 "storage": Storage(keep_runs=40, min_free=10**7),

@@ -22,7 +22,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from tests.torture.service_checks import fault_of_recording, faults_of_results
 from tests.torture.service_kills import BEGIN, processes
 from tests.torture.service_program import FastClock
 from tests.torture.service_program import main as serve
+from tests.tui.demo_bench import DEMO
 from tui.service.clock import SystemTime
 from tui.service.processes.finish import Outcome, Request, finish
 from tui.service.processes.steps import ProcessSteps
@@ -68,8 +68,7 @@ class Acknowledgements(logging.Handler):
 def served(library: Path, folder: Path) -> list[Operation]:
     """Serve a bench until some runs are over; return what happened to files."""
     log, disk = folder / "log", folder / "recordings"
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    with simulated(parse(text), speed=RATE) as reachable:
+    with simulated(parse(DEMO), speed=RATE) as reachable:
         changes = {"schedule": Schedule(runs=(ENTRY,)), "storage": Storage(keep_runs=N_KEPT)}
         path = folder / "bench.toml"
         path.write_text(dump(reachable.model_copy(update=changes)), encoding="utf-8")

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.torture.fault_commands import commands, device_commands, devices
+from tests.torture.fault_commands import SPEED, commands, device_commands
 from tests.torture.faulty_disk import FAULTS, FOREVER, Command, FaultyDisk, library, torture
+from tests.tui.demo_bench import demo_devices
 
 SAMPLE = {"import": 3, "results in a recording": 2, "archive": 1}
 """Commands, and how many of their calls fail."""
@@ -47,7 +48,7 @@ def test_a_call_that_fails_once_gives_no_wrong_number(tmp_path: Path, inputs: Pa
 
 @pytest.mark.long
 def test_no_fault_of_the_disk_loses_what_devices_sent(tmp_path: Path, inputs: Path) -> None:
-    with devices(inputs) as bench:
+    with demo_devices(inputs, speed=SPEED) as bench:
         places = {"record": 1, "run": 1}
         assert wrong(tmp_path, device_commands(bench), places, *FAULTS) == []
 
@@ -58,7 +59,7 @@ def test_a_recording_that_cannot_begin_ends_with_a_message(tmp_path: Path, input
     built = library(tmp_path)
     if built is None:
         pytest.skip("no gcc, or not Linux: nothing can fail")
-    with devices(inputs) as bench, FaultyDisk(built, tmp_path) as disk:
+    with demo_devices(inputs, speed=SPEED) as bench, FaultyDisk(built, tmp_path) as disk:
         command = device_commands(bench)["record"]
         for place in range(1, 9):
             disk.disk.mkdir()

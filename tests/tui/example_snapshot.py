@@ -6,7 +6,6 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +38,7 @@ from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
 from estimator.types import FloatArray
+from tests.tui.demo_bench import DEMO
 from tui.application.controls import Preview
 from tui.application.plan import TestPlan
 
@@ -246,8 +246,7 @@ def empty_snapshot() -> Snapshot:
 
 def demo_bench() -> Bench:
     """Return the bench of the demo: three sensors, no limits."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    return parse(text)
+    return parse(DEMO)
 
 
 @contextmanager

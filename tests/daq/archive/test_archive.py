@@ -380,8 +380,8 @@ def _at_limits(name: str, counts: NDArray[np.int32]) -> NDArray[np.int32]:
 
 def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
     paths = [
-        record(tmp_path / "limits.h5", device=_at_limits),
-        record(tmp_path / "fine.h5", begin_ns=START_NS + 9 * HOUR_NS),
+        record(tmp_path / "limits.h5", hours=0.6, device=_at_limits),
+        record(tmp_path / "fine.h5", hours=0.6, begin_ns=START_NS + 9 * HOUR_NS),
     ]
     store = store_for(tmp_path / "store", paths[0])
     assert fill(store, paths) == []

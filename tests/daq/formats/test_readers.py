@@ -132,11 +132,16 @@ def test_a_pickle_named_as_a_waveform_is_not_run(tmp_path: Path) -> None:
         read_waveforms([response])
 
 
-def test_npz_one_array_a_sensor(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
+@pytest.mark.parametrize("kind", ["npz", "mat"])
+def test_npz_and_mat_have_one_array_a_sensor(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"a.{kind}"
     a, b = counts(300).reshape(100, 3), np.arange(100.0)
-    np.savez(path, sampling_rate=RATE, start_time="2026-11-21T03:00:00.005Z", A=a, B=b)
-    first, second = read_npz(path)
+    arrays = {"sampling_rate": RATE, "start_time": "2026-11-21T03:00:00.005Z", "A": a, "B": b}
+    if kind == "npz":
+        np.savez(path, **arrays)  # type: ignore[arg-type]  # names of arrays
+    else:
+        savemat(path, arrays)
+    first, second = (read_npz if kind == "npz" else read_mat)(path)
     assert (first.name, first.channels, first.sampling_rate) == ("A", ("1", "2", "3"), RATE)
     np.testing.assert_array_equal(first.stretches[0].counts, a)
     assert first.stretches[0].start_utc_ns == 1_795_230_000_005_000_000
@@ -177,18 +182,6 @@ def test_npz_pickles_and_other_files_are_refused(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         with pytest.raises(ImportFormatError, match=name):
             read_npz(tmp_path / name)
-
-
-def test_mat_is_read_as_npz_is(tmp_path: Path) -> None:
-    path = tmp_path / "a.mat"
-    a, b = counts(300).reshape(100, 3), np.arange(100.0)
-    start = "2026-11-21T03:00:00.005Z"
-    savemat(path, {"sampling_rate": RATE, "start_time": start, "A": a, "B": b})
-    first, second = read_mat(path)
-    assert (first.name, first.channels, first.sampling_rate) == ("A", ("1", "2", "3"), RATE)
-    np.testing.assert_array_equal(first.stretches[0].counts, a)
-    assert first.stretches[0].start_utc_ns == 1_795_230_000_005_000_000
-    assert second.stretches[0].counts.shape == (100, 1)
 
 
 @pytest.mark.parametrize(

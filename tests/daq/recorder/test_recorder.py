@@ -319,17 +319,6 @@ async def test_sensors_on_one_port_share_a_session(tmp_path: Path) -> None:
     assert run.device("bus").n_sessions == 1
 
 
-async def test_an_event_of_a_device_is_recorded(tmp_path: Path) -> None:
-    run = Run(tmp_path / "r.h5", "a")
-    async with run.going():
-        run.device("a").items.put_nowait(Event("a", "checksum", "2 frames", run.clock.now()))
-        await run.sent("a", 0, 100)
-    with Recording.open(run.path) as recording:
-        assert ("a", "checksum", "2 frames") in [
-            (e.sensor, e.kind, e.text) for e in recording.events
-        ]
-
-
 async def test_a_device_full_of_events_does_not_fill_the_file(tmp_path: Path) -> None:
     """Ten events a second for 100 s that say the same, other kinds, and texts without end."""
     run = Run(tmp_path / "r.h5", "a")

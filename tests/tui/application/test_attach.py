@@ -6,23 +6,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import pytest
 from textual.pilot import Pilot
 
-from daq.bench.loading import dump
-from daq.devices.bench_file import load, parse
+from daq.devices.bench_file import load
 from daq.estimation.settings import Settings
 from daq.recording.control import ask
 from daq.recording.reader import Recording
 from tests.tui.application.screen_text import screen_text
+from tests.tui.demo_bench import demo_devices
 from tests.waiting import limit
 from tui.application.app import HuddleApp
 from tui.commands.tui_controls import BenchControls
-from tui.simulation.devices import simulated
 
 pytestmark = [
     pytest.mark.long,
@@ -33,10 +31,7 @@ pytestmark = [
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Path]:
     """Yield a bench file that reaches three simulated accelerometers."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    path = tmp_path / "bench.toml"
-    with simulated(parse(text), speed=8.0) as reachable:
-        path.write_text(dump(reachable), encoding="utf-8")
+    with demo_devices(tmp_path, speed=8.0) as path:
         yield path
 
 

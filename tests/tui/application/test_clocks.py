@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from daq.estimation.snapshot_diagnostics import (
 )
 from daq.results.clock_effect import effect, effect_by_sensor
 from daq.results.result import Result
+from tests.tui.demo_bench import DEMO
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.application.test_view.clocks import clock_line, drift_lines, drift_title
 from tui.application.test_view.plot import TimeAxis
@@ -125,8 +125,7 @@ def test_report_and_application_judge_clocks_alike(share: float) -> None:
 
 @pytest.mark.parametrize(("share", "added"), [(0.0, 0.0), (0.1, 0.4), (3.0, 1.0)])
 def test_demo_allows_for_what_clocks_add(share: float, added: float) -> None:
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    scenario = scenario_of(parse(text))
+    scenario = scenario_of(parse(DEMO))
     exact, ours = (
         compare(Result(made_snapshot(clock_share=each), SETTINGS), scenario)
         for each in (0.0, share)

@@ -7,7 +7,6 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from daq.preflight.device_check import DiscoveredDevice, network_ports
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_attach import until
+from tests.tui.demo_bench import DEMO
 from tests.tui.example_snapshot import demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
@@ -264,7 +264,6 @@ async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     path = tmp_path / "bench.toml"
     keys: list[str] = []
 
@@ -272,7 +271,7 @@ async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
         keys.extend(some)
         await pilot.press(*some)
 
-    with simulated(parse(text), speed=8.0) as reachable:
+    with simulated(parse(DEMO), speed=8.0) as reachable:
         ports = [sensor.port for sensor in reachable.sensors]
         first = FirstBenchApp(ComputerControls(path, ports, draft(path)))
         async with first.run_test(size=SIZES["small"]) as pilot:

@@ -369,11 +369,20 @@ def test_noise_parameters_on_request(tmp_path: Path) -> None:
     assert not [key for key in first if f"`{key}`" not in documented]
 
 
-def test_a_band_beyond_the_frequencies_is_exit_2(tmp_path: Path) -> None:
+def test_options_that_do_not_go_with_a_recording_are_exit_2(tmp_path: Path) -> None:
     file = str(imported(tmp_path))
     result = huddle("estimate", file, "--segment", "1s", "--band", "60:70", code=2)
     assert "no frequency between 60 and 70 Hz" in result.stderr
     assert not result.stdout
+    for options in (
+        ("--dimension", "2", "--method", "three-sensor"),
+        ("--dimension", "many"),
+        ("--gain", "Q=2"),
+        ("--gain", "A"),
+        ("--gain", "A=0"),
+        ("--unit", "kg"),
+    ):
+        printed("estimate", file, "--segment", "1s", *options, code=2)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="locales")

@@ -12,7 +12,6 @@ import os
 import shutil
 import zlib
 from collections.abc import Callable, Iterator
-from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from daq.recording.reader import Recording
 from tests import command
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
+from tests.tui.demo_bench import DEMO
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
 
@@ -97,8 +97,7 @@ def snapshot(made: huddle.Result) -> Snapshot:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Simulate sensors with a limit."""
     folder = tmp_path_factory.mktemp("simulated")
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    text = text.replace("sampling_rate = 200.0", "sampling_rate = 50.0")
+    text = DEMO.replace("sampling_rate = 200.0", "sampling_rate = 50.0")
     text += '[[limits]]\nname = "low"\nfrequency = [4.0, 18.0]\npsd = [1e-15, 1e-15]\n'
     (folder / "bench.toml").write_text(text, encoding="utf-8")
     options = (folder / "bench.toml", "--duration", "40s", "--out", folder / "s.h5")

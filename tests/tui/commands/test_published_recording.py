@@ -158,18 +158,6 @@ def test_the_report_shows_the_angles_and_where_the_model_test_fails(
     assert "XX.TST5.00 → XX.TST5.10" in long
 
 
-def test_options_of_the_estimate_that_do_not_go_together_are_exit_2(tst: Path) -> None:
-    for options in (
-        ("--dimension", "2", "--method", "three-sensor"),
-        ("--dimension", "many"),
-        ("--gain", "Q=2"),
-        ("--gain", "XX.TST5.10"),
-        ("--gain", "XX.TST5.10=0"),
-        ("--unit", "kg"),
-    ):
-        printed("estimate", str(tst), *options, code=2)
-
-
 @pytest.mark.long
 def test_octaves_and_dimension_through_the_command(tst: Path) -> None:
     document = result_of(

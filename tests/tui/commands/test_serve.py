@@ -9,7 +9,6 @@ import signal
 import sys
 import time
 from datetime import datetime, timedelta
-from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -21,6 +20,7 @@ from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, RecordingError
 from daq.recorder.schedule import utc_now
 from daq.recording.reader import Recording
+from tests.tui.demo_bench import DEMO
 from tests.waiting import limit
 from tui.commands.serve import AlreadyServedError, accepted, serve_runs
 from tui.service.clock import SystemTime
@@ -32,7 +32,6 @@ from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
-DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
 DUE = utc_now().replace(microsecond=0) - timedelta(hours=1)
 
 

@@ -91,10 +91,10 @@ def test_paper_has_a_title_an_outline_and_tags(reported: Reported) -> None:
 
 def test_signatures_are_not_alone_on_their_page(reported: Reported) -> None:
     """However much of the last page but one is filled."""
-    test, *_, settings, signed = reported.report.sections
+    *_, settings, signed = reported.report.sections
     for n_lines in range(4, 40, 9):
         filling = Section("Filling", tuple(Paragraph(f"line {n}") for n in range(n_lines)))
-        report = replace(reported.report, sections=(test, filling, settings, signed))
+        report = replace(reported.report, sections=(filling, settings, signed))
         *_, last = PdfReader(paper_of(report)).pages
         text = last.extract_text()
         assert "Signature" in text

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from datetime import UTC, datetime
-from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from daq.bench.loading import dump
 from daq.bench.model import Bench, Limit
 from daq.devices.bench_file import parse
 from tests.daq.archive import months
+from tests.tui.demo_bench import DEMO
 from tests.waiting import limit
 from tui.service.processes.finish import Outcome, Request
 from tui.service.processes.steps import ProcessSteps
@@ -53,10 +53,6 @@ def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return record
 
 
-def demo_bench() -> str:
-    return resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-
-
 def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None:
     subprocess.run([sys.executable, "-m", "tui"], check=False, capture_output=True)
     assert record.exists()
@@ -65,7 +61,7 @@ def test_these_modules_would_run_in_an_unprotected_process(record: Path) -> None
 @pytest.mark.long
 def test_recorders_and_estimates_of_a_service_execute_none(record: Path) -> None:
     """Nor what ends a recording at its condition."""
-    with simulated(parse(demo_bench()), speed=8.0) as reachable:
+    with simulated(parse(DEMO), speed=8.0) as reachable:
         limits = (Limit(name="mask", frequency=(1.0, 30.0), psd=(1e-9, 1e-9)),)
         bench = reachable.model_copy(update={"limits": limits})
         Path("bench.toml").write_text(dump(bench), encoding="utf-8")

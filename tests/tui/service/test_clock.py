@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -25,6 +24,7 @@ from daq.bench.model import Bench
 from daq.devices.bench_file import load, parse
 from daq.protocols.block import EventKind
 from daq.recording.reader import Recording
+from tests.tui.demo_bench import DEMO
 from tests.waiting import limit
 from tui.service import clock as clock_module
 from tui.service.clock import SystemTime
@@ -32,7 +32,6 @@ from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore
 from tui.simulation.devices import simulated
 
-DEMO = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
 SECONDS = 8
 """Length of a window."""
 DAY = timedelta(days=1)

@@ -6,12 +6,10 @@ import errno
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from daq.host_clock import SystemClock
-from daq.protocols.block import Block, HostTime
 from daq.recording.reader import Recording
+from tests.daq.recording.sending_bench import Bench
 from tests.tui.example_snapshot import growing
 from tests.tui.service.bench_files import Place
 from tui.commands.runs import pin
@@ -20,21 +18,11 @@ from tui.service.processes.finish import Request, finish
 from tui.service.records.run_state import RunState
 from tui.service.records.storage import remove
 
-RATE = 200  # of the demo
-
 
 def record(path: Path, seconds: int, continues: str = "", *, closed: bool = True) -> str:
     """Write a recording of the demo's bench; return its run_id."""
-    rng = np.random.default_rng(3)
-    begun = SystemClock().now()
     with growing(path, continues=continues) as writer:
-        for second in range(seconds):
-            ns = (second + 1) * 10**9
-            at = HostTime(begun.monotonic_ns + ns, begun.utc_ns + ns)
-            for sensor in "ABC":
-                counts = rng.integers(-999, 999, (RATE, 3)).astype(np.int32)
-                writer.append(Block(sensor, second * RATE, counts, at))
-        writer.commit()
+        Bench(writer).send("ABC", seconds)
         if closed:
             writer.close()
     with Recording.open(path) as recording:

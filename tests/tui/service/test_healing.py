@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import logging
 import math
 import sqlite3
+import tempfile
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
@@ -33,13 +35,27 @@ from tui.service.records.store import COPIES, RunStore
 HOUR = 3600.0
 
 
+@functools.cache
+def finished(part: str) -> tuple[Outcome, dict[str, bytes]]:
+    """Return what came of a run, and the files of its folder: made once for all tests."""
+    with tempfile.TemporaryDirectory() as name:
+        place = Place(Path(name))
+        (run,) = next_runs(place.bench, START, set())
+        folder = place.bench.recording_directory
+        record(folder / part, 12)
+        run = run.to(RunState.RECORDING, started=run.due, parts=(part,)).to(RunState.ESTIMATING)
+        outcome = finish(Request([str(folder / part)], {"segment": "2s"}, run=run.record()))
+        written = {path.name: path.read_bytes() for path in folder.glob(f"{Path(part).stem}.*")}
+        return outcome, written
+
+
 def done_run(place: Place, part: str = "r.h5") -> Run:
     """Return a run with a real recording and its real result, as the database has it."""
     (run,) = next_runs(place.bench, START, set())
     run = run.to(RunState.RECORDING, started=run.due, parts=(part,)).to(RunState.ESTIMATING)
-    folder = place.bench.recording_directory
-    record(folder / part, 12)
-    outcome = finish(Request([str(folder / part)], {"segment": "2s"}, run=run.record()))
+    outcome, written = finished(part)
+    for name, content in written.items():
+        (place.bench.recording_directory / name).write_bytes(content)
     assert outcome.error == ""
     assert outcome.noise
     ended = run.due + timedelta(seconds=run.duration)

@@ -21,6 +21,7 @@ from daq.results.sources import sources
 from daq.transport.ports import caveats_of
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, spec
+from tests.tui.demo_bench import DEMO
 from tests.waiting import limit
 from tui.commands.main import app
 from tui.simulation.devices import simulated
@@ -49,8 +50,7 @@ def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
 
 
 def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    bench = parse(text)
+    bench = parse(DEMO)
     assert (bench.recording.duration, bench.speed) == (300.0, 4.0)
     said = " ".join(CliRunner().invoke(app, ["demo", "--help"]).output.replace("│", " ").split())
     assert "(default 5min)" in said
@@ -80,9 +80,8 @@ def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
     tmp_path: Path,
 ) -> None:
     """The bytes and the bench file are those of real devices: the server says what they are."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
     clean, out = tmp_path / "clean.toml", tmp_path / "clean.h5"
-    with simulated(parse(text), speed=1.0) as bench:
+    with simulated(parse(DEMO), speed=1.0) as bench:
         ports = list(bench.ports())
         own = bench.model_copy(update={"simulation": {}})
         assert not own.runs_simulated

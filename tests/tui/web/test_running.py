@@ -7,19 +7,16 @@ import signal
 import socket
 import sys
 from contextlib import ExitStack
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import pytest
 
-from daq.bench.loading import dump
-from daq.devices.bench_file import parse
 from daq.recording.reader import Recording
+from tests.tui.demo_bench import demo_devices
 from tests.tui.web.conftest import SIZES, opened
 from tests.tui.web.pages import READER, SECRETS, STEERER, Server, serving
 from tests.waiting import limit, wait_until
-from tui.simulation.devices import simulated
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,10 +34,7 @@ VIEWERS = 20
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Path]:
     """Yield a bench file with secrets that reaches three simulated accelerometers."""
-    text = resources.files("tui.resources").joinpath("demo.toml").read_text(encoding="utf-8")
-    path = tmp_path / "bench.toml"
-    with simulated(parse(text), speed=1.0) as reachable:
-        path.write_text(dump(reachable) + SECRETS, encoding="utf-8")
+    with demo_devices(tmp_path, speed=1.0, more=SECRETS) as path:
         yield path
 
 

@@ -304,14 +304,19 @@ def test_a_token_may_be_in_the_environment(tmp_path: Path, monkeypatch: pytest.M
         Access(web, b"key", ended)
 
 
-def test_a_visit_lasts_over_a_restart_and_ends_with_the_secret(tmp_path: Path) -> None:
+def test_visits_last_over_a_restart_and_end_with_a_log_out_or_the_secret(tmp_path: Path) -> None:
     bench = bench_file(tmp_path, SECRETS)
     with serving(bench) as first:
-        visit = first.visit()
+        visit, left = first.visit(), first.visit()
         visit.log_in(READER)
+        left.log_in(READER)
+        (token,) = set(re.findall(r'name="token" value="(\w+)"', left.get("/tests").text))
+        assert left.post("/logout", {"token": token}).status == 303
+        assert left.get("/tests").status == 303  # the same cookie
         assert visit.get("/tests").status == 200
         port = int(first.url.rsplit(":", 1)[1].strip("/"))
     with serving(bench, port=port):
+        assert left.get("/tests").status == 303
         assert visit.get("/tests").status == 200
     bench.write_text(re.sub(r"sha256:\w{64}", "sha256:" + 64 * "0", bench.read_text()))
     with serving(bench, port=port):
