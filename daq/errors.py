@@ -129,6 +129,10 @@ class ArchiveError(HuddleError, OSError):
     """A store of spectra cannot be read or written."""
 
 
+class EndedProcessError(HuddleError, ChildProcessError):
+    """A process that worked for this one was ended."""
+
+
 class WrongArchiveError(ArchiveError):
     """A file is no store, has a newer format, or has other settings or sensors than requested."""
 

@@ -133,6 +133,8 @@ class Estimation:
     live : bool
         Whether memory is limited: an estimate of very many channels then has the first sensors
         only, and is never finished.
+    jobs : int
+        Processes that may take the segments of long, closed recordings. The result is the same.
 
     Raises
     ------
@@ -151,7 +153,9 @@ class Estimation:
         *,
         diagnosis_share: float = DIAGNOSIS_SHARE,
         live: bool = False,
+        jobs: int = 1,
     ) -> None:
+        self._jobs = jobs
         if not paths:
             raise CannotAlignError("no recording given; expected at least one")
         self._recordings: list[ReadableRecording] = []
@@ -205,7 +209,7 @@ class Estimation:
         self.close()
 
     def _pass(self, recording: ReadableRecording) -> Pass:
-        return Pass(recording, self.settings, self._sensors)
+        return Pass(recording, self.settings, self._sensors, jobs=self._jobs)
 
     @property
     def is_whole(self) -> bool:
@@ -458,6 +462,7 @@ def estimate(
     settings: Settings | None = None,
     *,
     progress: Progress | None = None,
+    jobs: int = 1,
 ) -> Snapshot:
     """Estimate the self-noise from finished recordings (or from what there is of a growing one).
 
@@ -469,15 +474,19 @@ def estimate(
         Default: those of the bench in the first recording.
     progress : callable, optional
         Receives the number of finished segments, and of all.
+    jobs : int
+        As for `Estimation`.
 
     Raises
     ------
     RecordingError, CannotAlignError
         If a file cannot be read, or its sensors not be aligned.
+    EndedProcessError
+        If another process was ended, as for lack of memory.
     NoResultError
         If there is too little for any of the methods.
     """
-    with reused(), Estimation(paths, settings) as estimation:
+    with reused(), Estimation(paths, settings, jobs=jobs) as estimation:
         snapshot = estimation.finish(progress)
         del estimation
     return snapshot

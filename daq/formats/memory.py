@@ -94,6 +94,9 @@ class SensorInMemory:
         """Return samples as they were given: none is damaged."""
         return self.counts(first_row, last_row), []
 
+    def locate(self) -> None:
+        """Do nothing: samples are arrays."""
+
     def instants_ns(self, first_row: int = 0, last_row: int | None = None) -> NDArray[np.int64]:
         """Refuse: no sample has an instant of its own."""
         raise RecordingError(

@@ -74,6 +74,9 @@ class ReadableSensor(Protocol):
     ) -> tuple[NDArray[Any], list[tuple[int, int]]]:
         """Return raw counts, and the ranges (first, last + 1) of damaged rows, which are zero."""
 
+    def locate(self) -> None:
+        """Look up where all samples are in the file: all are about to be read."""
+
     @property
     def n_damaged(self) -> int:
         """Number of damaged blocks read so far."""

@@ -323,6 +323,11 @@ class ChunkedRows:
         self._check_chunks(first_row, last_row)
         return np.asarray(self._dataset[first_row:last_row])
 
+    def locate(self) -> None:
+        """Look up where the chunks of a closed file are; once."""
+        if self._located is None and self.is_closed and self._direct:
+            self._located = LocatedChunks(self._dataset)
+
     def _check_chunks(self, first_row: int, last_row: int) -> None:
         """Refuse chunks that HDF5 would inflate beyond their size; each is looked at once."""
         for row in range(first_row // self._length * self._length, last_row, self._length):
@@ -360,8 +365,8 @@ class ChunkedRows:
         """Put whole chunks, from row ``start`` of the dataset on, into rows; return if all are."""
         self._n_fetched += len(rows) // self._length
         many = self._n_fetched * self._length >= _LOCATED_FROM * len(self._dataset)
-        if self._located is None and self.is_closed and many:
-            self._located = LocatedChunks(self._dataset)
+        if many:
+            self.locate()
         first, n_chunks, stored = start // self._length, len(rows) // self._length, None
         if self._located is not None:
             if self._located.read(first, rows):
@@ -492,6 +497,10 @@ class SensorRecord:
             If the file is damaged at these rows.
         """
         return self._read(self._sample_rows, first_row, last_row)
+
+    def locate(self) -> None:
+        """Look up where all samples are in the file: all are about to be read."""
+        self._sample_rows.locate()
 
     def intact_counts(
         self, first_row: int, last_row: int

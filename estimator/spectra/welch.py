@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -215,12 +216,23 @@ class CrossSpectra:
             self._single.add(spectra[:, self._single.bins])
         self.n_segments += len(spectra)
 
-    def products(self, spectra: ComplexArray) -> FloatArray | None:
-        """Return the sum of products of segments for `add_spectra`; threads may call it.
+    def products(self, spectra: ComplexArray, out: FloatArray | None = None) -> FloatArray | None:
+        """Return the sum of products of segments for `add_spectra`, in `out` if given.
 
-        None where `add_spectra` does not use it: of one segment, and where sums are large.
+        Threads may call it. None where `add_spectra` does not use it: of one segment, and where
+        sums are large.
         """
-        return self._products.gram(spectra)
+        return self._products.gram(spectra, out)
+
+    def add_products(self, products: FloatArray, single: NDArray[np.complex64]) -> None:
+        """Add segments as `add_spectra` does, by what `products` returned of them.
+
+        `single` are their spectra at the bins of `segments`, which must be kept.
+        """
+        self._products.add_gram(products)
+        if self._single is not None:
+            self._single.add(single)
+        self.n_segments += len(single)
 
     def _keep(self, single: list[ComplexArray]) -> None:
         if self._single is not None:
@@ -295,6 +307,11 @@ class CrossSpectra:
             np.fft.rfft(segments, axis=1, out=spectra)
             spectra[:, self._trend_bins] -= self._trend_spectra @ trend[:n]
             yield spectra
+
+    @property
+    def products_shape(self) -> tuple[int, ...]:
+        """Shape of what `products` returns; empty where sums are large."""
+        return self._products.gram_shape if self._products.is_small else ()
 
     @property
     def n_effective(self) -> float:
@@ -466,16 +483,17 @@ class _Products:
         self._total = np.zeros((n_freqs, n_channels, n_channels))
         self._gram: FloatArray | None = None
         self._waiting: list[ComplexArray] = []
-        self._is_small = n_freqs * n_parts**2 <= KEPT_VALUES
+        self.gram_shape = n_freqs, n_parts, n_parts
+        self.is_small = math.prod(self.gram_shape) <= KEPT_VALUES
         step = max(1, min(FREQUENCIES_PER_BLOCK, PRODUCT_VALUES // n_parts**2))
         self._pieces = [slice(low, low + step) for low in range(0, n_freqs, step)]
 
-    def gram(self, spectra: ComplexArray) -> FloatArray | None:
+    def gram(self, spectra: ComplexArray, out: FloatArray | None = None) -> FloatArray | None:
         """Return the products of segments as a small sum keeps them; None where it does not."""
-        if not self._is_small or len(spectra) < 2:
+        if not self.is_small or len(spectra) < 2:
             return None
         parts = spectra.view(np.float64)
-        found = np.empty((parts.shape[1], parts.shape[2], parts.shape[2]))
+        found = np.empty(self.gram_shape) if out is None else out
         for some in self._pieces:
             own = parts[:, some]
             np.matmul(own.transpose(1, 2, 0), own.swapaxes(0, 1), out=found[some])
@@ -485,10 +503,8 @@ class _Products:
         """Add segments by their spectra, contiguous, or by what `gram` returned of them."""
         gram = self.gram(spectra) if gram is None else gram
         if gram is not None:
-            if self._gram is None:
-                self._gram = np.zeros_like(gram)
-            self._gram += gram
-        elif self._is_small:  # of one segment: cheaper than of real and imaginary parts
+            self.add_gram(gram)
+        elif self.is_small:  # of one segment: cheaper than of real and imaginary parts
             for some in self._pieces:
                 found = spectra[0, some]
                 self._total[some] += _packed(found[:, :, None] * found[:, None, :].conj())
@@ -496,6 +512,12 @@ class _Products:
             self._waiting.append(spectra.copy())
             if sum(map(len, self._waiting)) >= TOGETHER:
                 self._add_waiting()
+
+    def add_gram(self, gram: FloatArray) -> None:
+        """Add segments by what `gram` returned of them."""
+        if self._gram is None:
+            self._gram = np.zeros_like(gram)
+        self._gram += gram
 
     def _add_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
@@ -651,7 +673,7 @@ class SegmentSpectra:
         self._kept = np.empty((0, len(bins), n_channels), np.complex64)
         self._n_kept = 0
 
-    def add(self, spectra: ComplexArray) -> None:
+    def add(self, spectra: ComplexArray | NDArray[np.complex64]) -> None:
         """Add the spectra of segments, in order of time.
 
         Parameters

@@ -53,10 +53,14 @@ class DelayMeasurement:
         return self._meter is not None
 
     @property
+    def measures(self) -> bool:
+        """Whether the delays of segments are wanted."""
+        return self._is_wanted and bool(self._aligned.measurable)
+
+    @property
     def fewest(self) -> int:
         """Segments to take together so that delays can be measured, some of them with gaps."""
-        wanted = self._is_wanted and bool(self._aligned.measurable)
-        needed = wanted and (self._meter is None or not self._meter.has_tried)
+        needed = self.measures and (self._meter is None or not self._meter.has_tried)
         return 2 * MIN_SEGMENTS * max(self._aligned.dims) if needed else 0
 
     @property
@@ -138,7 +142,7 @@ class DelayMeasurement:
         return bool(off[:, measured].any())
 
     def _wanted_meter(self) -> DelayEstimator | None:
-        if not (self._is_wanted and self._aligned.measurable):
+        if not self.measures:
             return None
         if self._meter is None:
             edges = np.cumsum([0, *self._aligned.dims])

@@ -38,8 +38,8 @@ class FlatlineDetector:
         self._n_parts = max(1, min(_PARTS, hop // _MIN_SAMPLES))
         self._length = hop // self._n_parts
         self._seconds = hop / self._n_parts / sampling_rate
-        self._still = np.zeros(n_channels, dtype=np.int64)
-        self._seen = 0
+        self.counts = np.zeros(n_channels + 1, dtype=np.int64)
+        """Parts in which each channel stood still, and last the parts seen."""
 
     def add(self, samples: FloatArray, usable: NDArray[np.bool_]) -> None:
         """Look at whole hops of `samples`, shape (n_samples, n_channels), where all are usable."""
@@ -52,7 +52,7 @@ class FlatlineDetector:
         whole: NDArray[np.bool_] = np.ones(len(parts), np.bool_)
         if not usable.all():
             whole[:] = used.all(axis=1)
-        self._seen += int(whole.sum())
+        self.counts[-1] += int(whole.sum())
         first = parts[:, 0]
         perhaps = np.repeat(whole[:, None], first.shape[1], axis=1)
         for place in range(self._length // 3, self._length, max(1, self._length // 3)):
@@ -60,8 +60,9 @@ class FlatlineDetector:
             if not perhaps.any():  # of nearly all parts the first tells enough
                 return
         for number in np.flatnonzero(perhaps.any(axis=1)):
-            self._still += perhaps[number] & stands_still(parts[number])
+            self.counts[:-1] += perhaps[number] & stands_still(parts[number])
 
     def for_a_while(self) -> FloatArray:
         """Return for how long each channel stood still, in seconds; 0 if most of the time."""
-        return np.where(2 * self._still < self._seen, self._still * self._seconds, 0.0)
+        *still, seen = self.counts
+        return np.where(2 * np.array(still) < seen, np.array(still) * self._seconds, 0.0)

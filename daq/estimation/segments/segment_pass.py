@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from datetime import datetime
 from typing import TypeVar
@@ -18,6 +19,7 @@ from daq.bench.durations import stretch
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.grid import OwnSamples
 from daq.clocks.sensor_reader import GrowingRows
+from daq.estimation.segments import forked
 from daq.estimation.segments.clipping import in_clipped_blocks
 from daq.estimation.segments.delay_measurement import DelayMeasurement
 from daq.estimation.segments.flatline import FlatlineDetector, stands_still
@@ -55,13 +57,14 @@ def whole_segments(
 
 
 _Piece = TypeVar("_Piece")
+_Span = tuple[int, int]
 _NEAR = 0.05  # samples by which a stretch may begin or end later: fitted clocks are off by some µs
 _Read = TypeVar("_Read")
 
 _READERS = 2  # pieces being read while one is worked on
 
 
-def read_ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Iterator[_Read]:
+def read_ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Generator[_Read]:
     """Read pieces in order, the next ones while the one before is worked on."""
     if len(pieces) < 2:
         yield from map(read, pieces)
@@ -146,6 +149,7 @@ class GapBridge:
 _VALUES_AT_ONCE = 1 << 18  # samples times channels read together: 2 MB
 OCTAVES = 12
 """Stages of the multi-resolution mode: those without segments cost nothing."""
+_FEWEST_SHARED = 32  # pieces: a third of a second of work
 _NEIGHBOURS, _READ_AT_ONCE = 1.5, 8
 """Lengths from which segments are read apart, and how many are read together at most."""
 _MOST_PASSES = 4
@@ -175,6 +179,8 @@ class Pass:
     settings : Settings
     sensors : collection of str, optional
         Names of the sensors to estimate; default: all.
+    jobs : int
+        Processes that may take the segments of a long, closed recording (`forked`).
     """
 
     def __init__(
@@ -182,7 +188,10 @@ class Pass:
         recording: ReadableRecording,
         settings: Settings,
         sensors: Collection[str] | None = None,
+        *,
+        jobs: int = 1,
     ) -> None:
+        self._jobs = jobs
         recording = at_rates(recording, settings.sampling_rates)
         self.recording = recording
         self.aligned = AlignedRecording(
@@ -386,28 +395,125 @@ class Pass:
 
         on_grid = self._why_on_grid()
 
-        def read(piece: tuple[int, int]) -> _Samples | OwnSpectra:
+        def read(piece: _Span, room: _Sums | None = None) -> _Samples | OwnSpectra:
             first, count = piece
+            out = None if room is None else room.products
             if source is self.aligned and not on_grid:
                 found = self._own_spectra((first + np.arange(count)) * hop)
                 if found is not None:
-                    return replace(found, products=self._products(found.spectra, first))
+                    return replace(found, products=self._products(found.spectra, first, out))
             part = self._read(source, self.filters, first * hop, count)
             is_small = count * self.welch.segment_length * self.n_channels <= MOST_VALUES
             if live or not is_small or self.octaves is not None or self._undisturbed is not None:
                 return part
             # in this thread: the one that adds them is waited for
             spectra = self._all.transforms(part.samples, np.arange(count) * hop)
-            return replace(part, spectra=spectra, products=self._products(spectra, first))
+            return replace(part, spectra=spectra, products=self._products(spectra, first, out))
 
-        for (first, count), part in zip(pieces, read_ahead(read, pieces), strict=True):
-            if isinstance(part, OwnSpectra):
-                self._take_spectra(part, first)
-            else:
-                self._take_samples(part, first, count, together=live)
-            self.n_seen += count
-            if progress is not None:
-                progress(count)
+        coming: Generator[_Samples | OwnSpectra | _Sums] = read_ahead(read, pieces)
+        if not live and self._is_shared(pieces):
+            coming = self._read_by_forks(read, pieces)
+        with closing(coming):
+            for (first, count), part in zip(pieces, coming, strict=True):
+                if isinstance(part, _Sums):
+                    self._take_sums(part, first, count)
+                elif isinstance(part, OwnSpectra):
+                    self._take_spectra(part, first)
+                else:
+                    self._take_samples(part, first, count, together=live)
+                self.n_seen += count
+                if progress is not None:
+                    progress(count)
+
+    def _is_shared(self, pieces: Sequence[_Span]) -> bool:
+        """Return whether forks can work out the sums of most of these pieces, and are worth it."""
+        every = 0 if self._ends is None else self._ends.every
+        is_sum = self.octaves is None and self._undisturbed is None and self._all.products_shape
+        by_spectra = not self._delays.measures or not (self._why_on_grid() or self._every == 1)
+        return bool(
+            self._jobs > 1
+            and forked.IS_POSSIBLE
+            and self.recording.closed
+            and len(pieces) >= _FEWEST_SHARED
+            and every > self._at_once  # so that pieces end where parts of time do
+            and self._at_once * self.welch.segment_length * self.n_channels <= MOST_VALUES
+            and is_sum
+            and by_spectra
+        )
+
+    def _read_by_forks(
+        self,
+        read: Callable[[_Span, _Sums | None], _Samples | OwnSpectra],
+        pieces: Sequence[_Span],
+    ) -> Generator[_Samples | OwnSpectra | _Sums]:
+        """Yield the sums of pieces from other processes; what has gaps or is left out is read here.
+
+        One process sums the same pieces in the same order: results are equal to the bit.
+        """
+        n_segments = max(count for _, count in pieces)
+        n_bins = 0 if self.single is None else len(self.single.bins)
+        n_freqs, n_picked = len(self.welch.frequencies), n_segments // self._every + 2
+        n_picked = n_picked if self._delays.measures else 0
+
+        def room() -> _Sums:
+            return _Sums(
+                forked.shared(self._all.products_shape, np.float64),
+                forked.shared((n_segments, n_bins, self.n_channels), np.complex64),
+                forked.shared((n_picked, n_freqs, self.n_channels), np.complex128),
+                forked.shared((self.n_channels + 1,), np.int64),
+            )
+
+        def work(piece: _Span, room: _Sums) -> bool:
+            n_damaged = sum(sensor.n_damaged for sensor in self._sensors)
+            part = read(piece, room)
+            is_intact = n_damaged == sum(sensor.n_damaged for sensor in self._sensors)
+            # else the other process is to count the damage, too
+            return is_intact and self._summed(part, *piece, room)
+
+        for sensor in self._sensors:
+            sensor.locate()  # once, for all processes
+        rooms = [[room() for _ in range(forked.ROOMS)] for _ in range(self._jobs)]
+        found = forked.worked_out(work, pieces, rooms)
+        for piece, sums in zip(pieces, found, strict=True):
+            yield read(piece, None) if sums is None else sums
+
+    def _summed(self, part: _Samples | OwnSpectra, first: int, count: int, room: _Sums) -> bool:
+        """Put into a room what a piece adds; return False where segments may be left out."""
+        hop = self.welch.hop
+        if part.spectra is None or part.products is None:
+            return False
+        if isinstance(part, OwnSpectra):
+            n_samples = (count - 1) * hop + self.welch.segment_length
+            kept = self._kept(first * hop, len(part.raw))
+            is_whole = self._unwanted(first * hop, n_samples) is None
+            picked = part.spectra[_is_picked(first + np.arange(count), self._every, again=True)]
+            is_whole &= len(picked) <= len(room.picked)
+            room.picked[: len(picked)] = picked[: len(room.picked)]
+        else:
+            kept = part.raw_kept
+            is_whole = part.unwanted is None and bool(part.usable.all())
+            is_whole &= not self._delays.measures
+        if not is_whole or self.single is None:
+            return False
+        stillness = FlatlineDetector(hop, self.n_channels, self.welch.sampling_rate)
+        stillness.add(part.raw, kept)
+        room.still[:] = stillness.counts
+        room.single[:count] = part.spectra[:, self.single.bins]
+        return True
+
+    def _take_sums(self, part: _Sums, first: int, count: int) -> None:
+        """Add whole segments by their sums; `first` is the number of the first of them."""
+        numbers = first + np.arange(count)
+        begins = self.reach + numbers * self.welch.hop
+        self.stillness.counts += part.still
+        for _ in by_part(self._all, numbers):  # one: the piece lies in one part of time
+            self._all.add_products(part.products, part.single[:count])
+        self._kept_at.add(begins)
+        self._n_taken += count
+        self._taken_at.add(self._positions(numbers))
+        if self._delays.measures:
+            some = _is_picked(numbers, self._every, again=True)
+            self._delays.measure_spectra(part.picked[: some.sum()].copy(), begins[some])
 
     def _cuts(self, begin: int, total: int) -> list[int]:
         """Return where pieces end, from `begin` on: also where parts of time do, if these are long.
@@ -421,12 +527,14 @@ class Pass:
         ends = [each * every // n for each in some] if every > at_once else []
         return [end for end in ends or range(begin, total, at_once) if end < total]
 
-    def _products(self, spectra: ComplexArray, first: int) -> FloatArray | None:
+    def _products(
+        self, spectra: ComplexArray, first: int, out: FloatArray | None = None
+    ) -> FloatArray | None:
         """Return the sum of products of segments from number `first` on, if one part has them."""
         every = 0 if self._ends is None else self._ends.every
         if every and first // every != (first + len(spectra) - 1) // every:
             return None
-        return self._all.products(spectra)
+        return self._all.products(spectra, out)
 
     def finish(
         self,
@@ -863,6 +971,20 @@ class _Samples:
     """Of all segments, also those that are left out."""
     products: FloatArray | None = None
     """Sum over `spectra`, where `CrossSpectra` uses it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sums:
+    """What a piece without gaps adds, in memory that processes share."""
+
+    products: FloatArray
+    """As `CrossSpectra.products` returns them."""
+    single: NDArray[np.complex64]
+    """Spectra of the segments at the kept bins, and room for more."""
+    picked: ComplexArray
+    """Spectra of the segments whose delays are measured, and room for more."""
+    still: NDArray[np.int64]
+    """`FlatlineDetector.counts`."""
 
 
 def still_for_a_while(passes: Sequence[Pass], settings: Settings) -> dict[int, float]:

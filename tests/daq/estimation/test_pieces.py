@@ -60,7 +60,7 @@ def test_products_of_pieces_are_those_that_are_added(
     made, used = [], []
     products, add = CrossSpectra.products, CrossSpectra.add_spectra
 
-    def noted(self: CrossSpectra, spectra: np.ndarray) -> np.ndarray | None:
+    def noted(self: CrossSpectra, spectra: np.ndarray, _out: object) -> np.ndarray | None:
         found = products(self, spectra)
         made.append(found)
         return found
