@@ -175,7 +175,6 @@ def _memory(few: float, many: float) -> list[Row]:
             "MB",
             at_most=250,
         ),
-        # the peak depends on whether both threads' buffers stand at the same time
         Row(f"the same, over that of {few:g} h", peaks[1] / peaks[0], "×", at_most=1.5),
     ]
 
@@ -207,7 +206,7 @@ def _live(repeats: int) -> list[Row]:
                 100 * seconds / (settings.hop / RATE),
                 "% of the time its new samples took",
                 at_most=share,
-                note="all threads together"
+                note=""
                 if snr > 1
                 else "motion lost in the noise everywhere; updates are spaced (Throttle)",
             )

@@ -80,7 +80,7 @@ def _scores(rng: np.random.Generator, snr: float) -> dict[str, FloatArray]:
     late = np.fft.irfft(np.fft.rfft(motion, axis=0) * turn[:, None], n, axis=0)
     third = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
     samples = np.hstack([motion, late @ truth.T, third]) + rng.standard_normal((n, 9))
-    spectra = CrossSpectra(WelchSettings(rate, segment), 9, threads=1)
+    spectra = CrossSpectra(WelchSettings(rate, segment), 9)
     spectra.add(samples, np.arange(0, n - segment + 1, segment // 2))
     found = calibrate_sensor(
         spectra.csm(),

@@ -89,7 +89,7 @@ def recorded(rng: np.random.Generator) -> tuple[np.ndarray, Bench]:
 def test_of(rng: np.random.Generator) -> Ended | None:
     """Return when a test ends; None where four hours do not decide it."""
     samples, bench = recorded(rng)
-    spectra = CrossSpectra(WELCH, len(CHANNELS), threads=1)
+    spectra = CrossSpectra(WELCH, len(CHANNELS))
     window = get_window(WELCH.window, WELCH.segment_length)
     looks: list[tuple[float, Prediction | None]] = []
     seconds = FIRST

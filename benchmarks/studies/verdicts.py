@@ -97,7 +97,7 @@ class SimulatedTest:
         )
         turned = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in DIMS]
         self._directions = np.vstack(turned)
-        self._spectra = CrossSpectra(self._welch, N_CHANNELS, threads=1)
+        self._spectra = CrossSpectra(self._welch, N_CHANNELS)
         self._pending = np.empty((0, N_CHANNELS))
         self._n_samples = 0
 

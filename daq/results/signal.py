@@ -475,7 +475,7 @@ class Signal:
             until = max(begin + 1, end)
             if rows[at] == rows[at + 1] or n_broken[begin] < n_broken[until + length - 2]:
                 continue
-            spectra = CrossSpectra(settings, 1, threads=1)
+            spectra = CrossSpectra(settings, 1)
             spectra.add(samples, np.arange(begin, until, settings.hop))
             psd[at] = spectra.csm()[:, 0, 0].real
         with np.errstate(divide="ignore", invalid="ignore"):

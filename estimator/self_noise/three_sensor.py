@@ -52,9 +52,9 @@ from estimator.self_noise.coherency import (
     inverse,
 )
 from estimator.self_noise.result import Flag, SelfNoise
-from estimator.spectra.welch import THREADS
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
+THREADS = 2
 NEIGHBOURS = 16
 """Number of sampled frequencies on either side whose variances are averaged."""
 DENSE_BINS = 32

@@ -68,7 +68,7 @@ class ChannelSets:
         """Add the segments that count in another recording; these are not judged again."""
         for columns, spectra in other.spectra.items():
             before = self._sums.get(columns)
-            known = CrossSpectra(self._welch, len(columns), threads=1)
+            known = CrossSpectra(self._welch, len(columns))
             if before is not None:
                 known = before if isinstance(before, CrossSpectra) else before.spectra()
             self._sums[columns] = known + spectra
@@ -99,4 +99,4 @@ class ChannelSets:
     def _new(self, n_channels: int) -> CrossSpectra | SelectedSpectra:
         if self._rejection is not None:
             return SelectedSpectra(self._welch, n_channels, rejection=self._rejection)
-        return CrossSpectra(self._welch, n_channels, threads=1)
+        return CrossSpectra(self._welch, n_channels)

@@ -3,19 +3,16 @@
 Convention, here and everywhere in this package: ``csm[f, p, q] = E[X_p conj(X_q)]``, one-sided,
 in unit**2/Hz. (``scipy.signal.csd(x, y)`` is its transpose.)
 
-Segments are processed in groups that fit into the cache. Several threads process equal shares;
-their sums are added in order, so that the result does not depend on timing. Spectra of single
-segments are kept at a few frequencies: they show changes with time.
+Segments are processed in groups that fit into the cache. Spectra of single segments are kept at a
+few frequencies: they show changes with time.
 """
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Literal, Self
 
@@ -34,7 +31,6 @@ FREQUENCIES_PER_BLOCK = 512
 PRODUCT_VALUES = 2**22  # maximum number of values of products of channels at a time: 32 MB
 KEPT_VALUES = 10**7  # maximum number of values of products that are kept: 80 MB
 TOGETHER = 16  # segments of many channels whose products are added together
-THREADS = 2
 BENT = 0.01
 """Share of its noise that the trend may take from a bin: 0.04 dB."""
 
@@ -114,8 +110,6 @@ class CrossSpectra:
     ----------
     settings : WelchSettings
     n_channels : int
-    threads : int
-        Maximum number of threads of `add`; use 1 if the caller already uses all processors.
     segments : SegmentSpectra, optional
         Receives the spectra of the single segments.
     ends : PartEnds, optional
@@ -127,7 +121,6 @@ class CrossSpectra:
         settings: WelchSettings,
         n_channels: int,
         *,
-        threads: int = THREADS,
         segments: SegmentSpectra | None = None,
         ends: PartEnds | None = None,
     ) -> None:
@@ -135,7 +128,6 @@ class CrossSpectra:
             raise EstimatorError(f"{n_channels} channels; expected at least one")
         self.settings = settings
         self.n_channels = n_channels
-        self._threads = threads
         self._single = segments
         self.ends = ends
         self.n_segments = 0
@@ -175,19 +167,8 @@ class CrossSpectra:
         samples = np.asarray(samples, dtype=np.float64)
         starts = np.asarray(starts, dtype=np.int64)
         self.check(samples, starts)
-        if starts.size == 0:
-            return
-        workers = min(self._threads, -(-len(starts) // self._block))
-        if workers == 1:
-            self._keep(self._add_to(self._products, samples, starts, self._work))
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                for total, single in pool.map(
-                    functools.partial(self._total, samples), np.array_split(starts, workers)
-                ):
-                    self._products.merge(total)
-                    self._keep(single)
-        self.n_segments += len(starts)
+        for spectra in self._transformed(samples, starts, self._work):
+            self._add(spectra)
 
     def add_spectra(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
         """Add segments by their spectra.
@@ -209,8 +190,10 @@ class CrossSpectra:
             raise EstimatorError(
                 f"spectra of shape {spectra.shape}, expected (n_segments, {n_freqs}, {n_channels})"
             )
-        if len(spectra) == 0:
-            return
+        if len(spectra):
+            self._add(spectra, products)
+
+    def _add(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
         self._products.add(spectra, products)
         if self._single is not None:
             self._single.add(spectra[:, self._single.bins])
@@ -234,11 +217,6 @@ class CrossSpectra:
             self._single.add(single)
         self.n_segments += len(single)
 
-    def _keep(self, single: list[ComplexArray]) -> None:
-        if self._single is not None:
-            for spectra in single:
-                self._single.add(spectra)
-
     def check(self, samples: FloatArray, starts: IntArray) -> None:
         """Raise the errors of `add` without adding segments."""
         if samples.ndim != 2 or samples.shape[1] != self.n_channels:
@@ -252,25 +230,6 @@ class CrossSpectra:
             raise EstimatorError(
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
             )
-
-    def _total(self, samples: FloatArray, starts: IntArray) -> tuple[_Products, list[ComplexArray]]:
-        """Return the products of the segments, and what `_add_to` returns."""
-        total = _Products(*self._shape)
-        return total, self._add_to(total, samples, starts, _Work())
-
-    def _add_to(
-        self, total: _Products, samples: FloatArray, starts: IntArray, work: _Work
-    ) -> list[ComplexArray]:
-        """Add the products of the segments to `total`.
-
-        Return the spectra of the segments at the kept frequencies, if there are any.
-        """
-        single: list[ComplexArray] = []
-        for spectra in self._transformed(samples, starts, work):
-            if self._single is not None:
-                single.append(spectra[:, self._single.bins])
-            total.add(spectra)
-        return single
 
     def transforms(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
         """Return the spectra of segments as `add_spectra` takes them; threads may call it.

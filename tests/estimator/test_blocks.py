@@ -91,7 +91,7 @@ def test_an_estimate_of_many_channels_keeps_few_matrices(monkeypatch: pytest.Mon
 
 def test_averages_of_many_channels_take_little_beside_their_sum() -> None:
     n_channels, length = 120, 64
-    spectra = CrossSpectra(WelchSettings(100.0, length), n_channels, threads=1)
+    spectra = CrossSpectra(WelchSettings(100.0, length), n_channels)
     samples = np.random.default_rng(0).standard_normal((2 * length, n_channels))
     starts = np.arange(3) * length // 2
     one = (length // 2 + 1) * n_channels**2 * 16

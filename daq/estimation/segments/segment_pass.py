@@ -119,7 +119,7 @@ class GapBridge:
 
     def __init__(self, welch: WelchSettings, n_channels: int, *, most: float) -> None:
         self._welch, self._most = welch, most
-        self.spectra = CrossSpectra(welch, n_channels, threads=1)
+        self.spectra = CrossSpectra(welch, n_channels)
         self.leakage = WindowLeakage(get_window(welch.window, welch.segment_length))
 
     def take(
@@ -243,9 +243,7 @@ class Pass:
         single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
         self.single = None if wanted.octaves or wanted.reject else single
         self._kept_at = GrowingRows(np.int64)
-        self._all = CrossSpectra(
-            self.welch, self.n_channels, threads=1, segments=self.single, ends=self._ends
-        )
+        self._all = CrossSpectra(self.welch, self.n_channels, segments=self.single, ends=self._ends)
         self._selected: CrossSpectra | None = None
         self._bridge: GapBridge | None = None
         if wanted.bridge > 0 and self._undisturbed is None and self.octaves is None:
@@ -315,7 +313,7 @@ class Pass:
         """
         self._ends = None  # the sums begin again: no parts of time are kept of them
         if self._undisturbed is None:
-            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, threads=1)
+            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels)
             return spectra
         self._selected = None
         return self._undisturbed.spectra() if last else self._undisturbed.drain()
@@ -569,7 +567,7 @@ class Pass:
         part = self._read(self.aligned, filters, begin - reach, count)
         usable = part.usable if part.unwanted is None else part.usable & ~part.unwanted
         starts = np.arange(count) * self.welch.hop
-        spectra = CrossSpectra(self.welch, self.n_channels, threads=1)
+        spectra = CrossSpectra(self.welch, self.n_channels)
         spectra.add(part.samples, starts[whole_segments(usable, starts, self.welch.segment_length)])
         return spectra
 

@@ -18,7 +18,7 @@ def taken(
 ) -> CrossSpectra:
     """Take the segments of samples, a few at a time."""
     ends = PartEnds(BINS, every)
-    spectra = CrossSpectra(SETTINGS, samples.shape[1], threads=1, ends=ends)
+    spectra = CrossSpectra(SETTINGS, samples.shape[1], ends=ends)
     n = (len(samples) - SETTINGS.segment_length) // SETTINGS.hop + 1
     place = 0
     while place < n:
@@ -56,7 +56,7 @@ def test_a_part_has_the_averages_of_its_own_segments() -> None:
         places = [p for p in range(5 * number, min(5 * number + 5, 49)) if p not in left_out]
         if number == len(found) - 1:
             places = [p for p in range(5 * number, 49) if p not in left_out]
-        alone = CrossSpectra(SETTINGS, 2, threads=1)
+        alone = CrossSpectra(SETTINGS, 2)
         alone.add(samples, np.array(places) * SETTINGS.hop)
         (own,) = Parts(BINS, (part,)).csm()
         np.testing.assert_allclose(own, alone.csm(), rtol=1e-9, atol=1e-13)
@@ -65,7 +65,7 @@ def test_a_part_has_the_averages_of_its_own_segments() -> None:
 
 def test_the_whole_is_the_same_to_the_bit_where_parts_end_with_it() -> None:
     samples = np.random.default_rng(5).standard_normal((3000, 3))
-    plain = CrossSpectra(SETTINGS, 3, threads=1)
+    plain = CrossSpectra(SETTINGS, 3)
     n = (3000 - 40) // 20 + 1
     plain.add(samples, np.arange(n) * 20)
     np.testing.assert_allclose(taken(samples).csm(), plain.csm(), rtol=1e-13, atol=1e-16)

@@ -204,7 +204,7 @@ def test_memory_does_not_grow_with_the_samples(monkeypatch: pytest.MonkeyPatch) 
         return peak_of(lambda: total.add(samples, starts)) - 16 * len(starts)
 
     peak(10_000)  # imports and first allocations
-    assert peak(800_000) < 2 * peak(40_000)  # two threads meet by chance
+    assert peak(800_000) < 1.5 * peak(40_000)
 
 
 def test_scale_divides_by_both_responses_and_marks_zeros() -> None:

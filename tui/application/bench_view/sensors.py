@@ -300,7 +300,7 @@ def _welch(
     settings = WelchSettings(
         sampling_rate=rate, segment_length=length, overlap=0.5, window="hann", detrend="linear"
     )
-    found = CrossSpectra(settings, samples.shape[1], threads=1)
+    found = CrossSpectra(settings, samples.shape[1])
     starts = np.arange(0, len(samples) - length + 1, settings.hop)
     found.add(np.ascontiguousarray(samples), starts)
     psd = np.diagonal(found.csm(), axis1=1, axis2=2).real
