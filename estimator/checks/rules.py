@@ -25,7 +25,7 @@ from estimator.checks.advice import Advice, Rank
 from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
-from estimator.checks.shared_motion import outsiders
+from estimator.checks.shared_motion import outsiders, shown_from
 from estimator.checks.shared_noise import SharedPairs
 from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.coherency import Coherency, presence
@@ -135,6 +135,9 @@ LARGE_ERROR = 0.5
 """Error, as a fraction of the noise, from which an estimate is wrong."""
 SMALL_ERROR = 0.05
 """Error, as a fraction of the noise, below which it is harmless."""
+WEAKER = 6.0
+"""SNR over that from which a dimension is significant, below which none is said to miss: it may be
+as strong as the others."""
 _NEARLY_SINGULAR = 30.0  # condition number; the scatter of smaller ones is no surprise
 
 
@@ -436,10 +439,10 @@ def _dimensions(
     if len(dims) < 2:
         return
     full = min(sorted(dims)[-2:])
+    shown = max(1.0, WEAKER * shown_from(dims, n_effective))
 
     def is_missing(band: BandDiagnosis) -> bool:
-        hidden = _is_weak(band)
-        return band.dimension < full and not hidden
+        return band.dimension <= full - 1 and bool(np.any(band.snr >= shown))
 
     for run in _runs(bands, is_missing):
         yield advice_on_model.MissingDimension(
@@ -450,7 +453,7 @@ def _dimensions(
             condition=max(b.condition for b in run),
         )
     limit = max(_NEARLY_SINGULAR, float(np.sqrt(n_effective)))
-    for run in _runs(bands, lambda band: band.dimension >= full and band.condition > limit):
+    for run in _runs(bands, lambda band: band.dimension > full - 1 and band.condition > limit):
         yield advice_on_model.NearlySingular(
             rank=Rank.TO_KNOW, band=_span(run), condition=max(b.condition for b in run)
         )

@@ -11,6 +11,7 @@ motion that fades shares less as well, but its noise is as before.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import combinations
 
@@ -355,6 +356,15 @@ def is_coherent(g: FloatArray, known: BoolArray, least: float = MIN_COHERENCE) -
     total, count = (np.cumsum(np.append(0.0, each)) for each in (np.where(known, g, 0.0), known))
     mean = (total[high] - total[low]) / np.maximum(count[high] - count[low], 1.0)
     return np.asarray((mean >= least) | (g >= _OF_A_LINE))
+
+
+def shown_from(dims: tuple[int, ...], n_effective: float) -> float:
+    """Return the SNR of each of two sensors from which their last dimension is significant."""
+    j, k = sorted(dims)[-2:]
+    limit = critical_value(2 * (k - j + 1), DIMENSION_LEVEL / math.comb(len(dims), 2))
+    averages = n_effective - (j + k) / 2
+    root = math.sqrt(-math.expm1(-limit / (2 * averages))) if averages > 0 else 1.0
+    return root / (1 - root) if root < 1 else math.inf
 
 
 def significant_dimensions(

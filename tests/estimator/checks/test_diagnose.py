@@ -251,6 +251,16 @@ def test_a_missing_dimension_is_reported() -> None:
     assert missing.condition > np.sqrt(1080)
 
 
+@pytest.mark.parametrize("snr", [0.5, 0.6, 0.8, 1.0])
+def test_no_dimension_of_motion_alike_in_all_is_said_to_miss(snr: float) -> None:
+    """With 45 averages, some of three dimensions are significant by chance."""
+    turned = Rotation.from_euler("yz", [30, 70], degrees=True).as_matrix()
+    csm = bench(np.eye(3), turned, turned.T, motion=snr * np.eye(3))
+    found = of(averages(csm, n=45), n=45)
+    assert np.any(found.dimension < 3)
+    assert not advice_of(MissingDimension, found)
+
+
 def test_noise_without_motion_is_reported() -> None:
     rng = np.random.default_rng(3)
     csm = random_bench(rng, dims=THREE, snr=0.05, noise_psd=np.ones(9))
