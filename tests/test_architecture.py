@@ -75,7 +75,7 @@ ARRAYS_OF = {
     "application/test_view/plotted.py", "application/test_view/units.py",
     "output/archive/document.py", "output/json_values.py",
     "output/noise_parameters.py", "output/results.py", "output/standing.py",
-    "page/drawing_on_pdf.py",
+    "page/axes.py",
     "web/chart.py", "web/signal.py", "web/traces.py",
 }  # fmt: skip
 """Modules that draw curves, count flags, or write arrays as text."""

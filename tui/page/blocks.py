@@ -6,7 +6,7 @@ is plain: who writes it escapes it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from estimator.records import dataclass
 from tui.page.table import Table, Tone
@@ -14,7 +14,9 @@ from tui.page.table import Table, Tone
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from matplotlib.axes import Axes
+
+Panel: TypeAlias = "Callable[[Any], None]"
+"""Draws into axes: those of `tui.page.axes` on paper, and those of matplotlib on screens."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,7 @@ class Plot:
     """
 
     title: str
-    panels: tuple[Callable[[Axes], None], ...]
+    panels: tuple[Panel, ...]
     n_columns: int
     height: float
     alt: str
@@ -81,9 +83,7 @@ class Plot:
     is_continued: bool = False
 
 
-def three_to_a_row(
-    panels: Sequence[Callable[[Axes], None]], title: str, *, height: float, alt: str
-) -> list[Plot]:
+def three_to_a_row(panels: Sequence[Panel], title: str, *, height: float, alt: str) -> list[Plot]:
     """Return a plot for each row of panels with titles of their own; the first has the key."""
     columns = min(3, max(2, len(panels)))
     rows = [tuple(panels[first : first + 3]) for first in range(0, len(panels), 3)]

@@ -12,18 +12,13 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.markers import TICKDOWN, TICKLEFT
-from matplotlib.ticker import NullLocator
-
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
     from matplotlib.transforms import Transform
 
     from tui.page.blocks import Plot
@@ -119,6 +114,8 @@ _LOOK: dict[Any, Any] = {  # matplotlib's own type of keys is a list of them all
 @contextmanager
 def look() -> Iterator[None]:
     """Draw in the report's own style, whatever a user's configuration says."""
+    import matplotlib as mpl  # noqa: PLC0415 - takes a third of a second
+
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
         mpl.rcParams.update(_LOOK)
@@ -132,21 +129,29 @@ def height_of(plot: Plot) -> float:
     return _above(plot) + plot.height + (TICKS if plot.is_continued else BOTTOM)
 
 
-def draw(plot: Plot, figure: Figure, *, left: float, top: float, width: float) -> None:
-    """Draw a plot into a part of a figure; all numbers in inches from its lower left corner."""
-    whole_width, whole_height = figure.get_size_inches()
+def places(
+    plot: Plot, left: float, top: float, width: float
+) -> list[tuple[float, float, float, float]]:
+    """Return left, bottom, width and height of the axes of each panel, in inches."""
     inner = width - LEFT - plot.right
     one = (inner - GAP * (plot.n_columns - 1)) / plot.n_columns
     bottom = top - _above(plot) - plot.height
+    return [
+        (left + LEFT + number * (one + GAP), bottom, one, plot.height)
+        for number in range(len(plot.panels))
+    ]
+
+
+def draw(plot: Plot, figure: Figure, *, left: float, top: float, width: float) -> None:
+    """Draw a plot into a part of a figure; all numbers in inches from its lower left corner."""
+    whole_width, whole_height = figure.get_size_inches()
     named: dict[str, Artist] = {}
-    for number, panel in enumerate(plot.panels):
-        place = (
-            (left + LEFT + number * (one + GAP)) / whole_width,
-            bottom / whole_height,
-            one / whole_width,
-            plot.height / whole_height,
-        )
-        axes = figure.add_axes(place)
+    for number, (panel, place) in enumerate(
+        zip(plot.panels, places(plot, left, top, width), strict=True)
+    ):
+        x, y, along, up = place
+        whole = (x / whole_width, y / whole_height, along / whole_width, up / whole_height)
+        axes = figure.add_axes(whole)
         panel(axes)
         if number:
             axes.tick_params(axis="y", labelleft=False, length=0)
@@ -178,6 +183,10 @@ def _join_minor_ticks(axes: Axes) -> None:
 
     Each tick of matplotlib is two texts and three lines: they took a tenth of a report.
     """
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+    from matplotlib.markers import TICKDOWN, TICKLEFT  # noqa: PLC0415
+    from matplotlib.ticker import NullLocator  # noqa: PLC0415
+
     both: tuple[tuple[Axis, str, Any, Transform], ...] = (
         (axes.xaxis, "xtick", TICKDOWN, axes.get_xaxis_transform(which="tick1")),
         (axes.yaxis, "ytick", TICKLEFT, axes.get_yaxis_transform(which="tick1")),
@@ -204,6 +213,8 @@ def _join_minor_ticks(axes: Axes) -> None:
 
 def alone(plot: Plot, width: float) -> Figure:
     """Return a figure that holds nothing else."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     height = height_of(plot)
     figure = Figure(figsize=(width, height))
     draw(plot, figure, left=0, top=height, width=width)

@@ -9,21 +9,23 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import singledispatchmethod
-from itertools import pairwise
+from importlib.util import find_spec
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-import matplotlib as mpl
-from fpdf import FPDF, FontFace, TextStyle
-from fpdf.enums import TableBordersLayout, WrapMode, XPos, YPos
+from fpdf import FPDF, TextStyle
+from fpdf.enums import MethodReturnValue, XPos, YPos
 
-from tui.page import drawing, drawing_on_pdf
+from tui.page import axes, drawing
 from tui.page.blocks import Items, KeyValues, Paragraph, Part, Plot, Report, Signatures
 from tui.page.drawing import WIDTH as INNER
+from tui.page.drawing_on_pdf import Page
 from tui.page.table import Cell, Table, Tone, tone_of
 
 MARGIN, TOP, BOTTOM = 0.58, 0.5, 0.65
@@ -41,6 +43,8 @@ BOX = 0.42
 LONGEST = 1500
 """Characters of a cell: a row must fit on a page."""
 _FAMILY = "DejaVu"
+_RIGHT_TO_LEFT = re.compile("[\u0590-\u08ff\ufb1d-\ufeff]")
+"""Letters whose order on paper is not that of the text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +147,8 @@ class _Paper(FPDF):
         super().__init__(
             unit="in", format="A4", enforce_compliance="PDF/A-3B" if archival else None
         )
-        fonts = Path(mpl.get_data_path(), "fonts", "ttf")
+        found = find_spec("matplotlib")  # has the fonts, and need not be loaded
+        fonts = Path(str(found and found.origin)).parent / "mpl-data" / "fonts" / "ttf"
         self.add_font(_FAMILY, "", fonts / "DejaVuSans.ttf")
         self.add_font(_FAMILY, "B", fonts / "DejaVuSans-Bold.ttf")
         self.set_margins(MARGIN, TOP, MARGIN)
@@ -312,9 +317,9 @@ class _Paper(FPDF):
         if part.title:
             left = self.l_margin - MARGIN
             self.lines(part.title, self.sizes.text, bold=True, indent=left, width=left + width)
-        page = drawing_on_pdf.Page(self, _FAMILY, self._out)
+        page = Page(self, _FAMILY, self._out)
         with self._marked_sequence(alt_text=part.alt):
-            drawing_on_pdf.draw(part, page, left=self.l_margin, top=self.y, width=width)
+            axes.draw(part, page, left=self.l_margin, top=self.y, width=width)
         self.set_xy(MARGIN, self.y + drawing.height_of(part))
 
     @part.register
@@ -386,31 +391,66 @@ class _Paper(FPDF):
         if part.title:
             self.lines(part.title, size, bold=True, indent=self.l_margin - MARGIN)
             self.ln(0.03)
-        self._style(size)
         self.set_draw_color(drawing.GRID)
         self.set_line_width(0.006)
-        with self.table(
-            borders_layout=TableBordersLayout.HORIZONTAL_LINES,
-            col_widths=widths,
-            headings_style=FontFace(emphasis="BOLD"),
-            line_height=size * self.sizes.line / 72,
-            padding=(self.sizes.row / 2, gap),
-            text_align=tuple("LEFT" if n in part.left else "RIGHT" for n in range(len(widths))),
-            v_align="TOP",
-            width=width,
-            align="LEFT",
-            wrapmode=WrapMode.WORD,
-        ) as table:
-            table.row(part.header, v_align="BOTTOM")
-            for cells in part.rows:
-                row = table.row()
-                for cell in cells:
-                    tone = tone_of(cell)
-                    style = FontFace(
-                        emphasis=None if tone == "plain" else "BOLD", color=_COLOURS[tone]
-                    )
-                    row.cell(_shown(cell), style=style)
+        scale, step = min(1.0, width / sum(widths)), size * self.sizes.line / 72
+        edges = list(accumulate((scale * each for each in widths), initial=self.l_margin))
+        places = list(pairwise(edges))
+        rows = [
+            [
+                self._broken(
+                    cell, right - left - 2 * gap, bold=not number or tone_of(cell) != "plain"
+                )
+                for cell, (left, right) in zip(cells, places, strict=True)
+            ]
+            for number, cells in enumerate((part.header, *part.rows))
+        ]
+
+        def height(number: int) -> float:
+            return self.sizes.row + step * max(map(len, rows[number]))
+
+        def set_row(number: int, cells: Sequence[str]) -> None:
+            below = self.y + height(number)
+            for column, (lines, (left, right)) in enumerate(zip(rows[number], places, strict=True)):
+                tone = tone_of(cells[column])
+                self._style(size, tone, bold=not number or tone != "plain")
+                up = step * len(lines) + self.sizes.row if not number else below - self.y
+                base = below - up + self.sizes.row / 2 + step / 2 + 0.3 * size / 72
+                for line in lines:
+                    back = 0.0 if column in part.left else self.get_string_width(line)
+                    x = left + gap if column in part.left else right - gap - back
+                    if _RIGHT_TO_LEFT.search(line):
+                        self.set_xy(x, base - step / 2 - 0.3 * size / 72)
+                        self.cell(h=step, text=line)
+                    else:  # costs a tenth
+                        self.text(x, base, line)
+                    base += step
+            self.y = below
+            if number < len(rows) - 1:
+                self.line(edges[0], below, edges[-1], below)
+
+        for number, cells in enumerate((part.header, *part.rows)):
+            with_next = height(number) + (height(1) if not number and part.rows else 0.0)
+            if self.will_page_break(with_next):
+                self.add_page()
+                if number:
+                    set_row(0, part.header)
+            set_row(number, cells)
         self.ln(self.sizes.part)
+
+    def _broken(self, text: str, width: float, *, bold: bool) -> list[str]:
+        """Return the lines of a cell, broken between words where it is wider."""
+        self._style(self.sizes.table, bold=bold)
+        text = _shown(text)
+        if "\n" not in text and self.get_string_width(text) <= width:
+            return [text]
+        lines: Any = self.multi_cell(width, text=text, dry_run=True, output=MethodReturnValue.LINES)
+        return [str(line).rstrip() for line in lines]
+
+    def get_string_width(self, s: str, *_: object, **__: object) -> float:
+        """Return how wide a text is; its order, right to left or not, does not change that."""
+        font = self.current_font
+        return float(font.get_text_width(s, self.font_size_pt, None)[1]) / self.k if font else 0.0
 
     def height(self, part: Part, width: float = INNER) -> float:
         """Return about how high a part is."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from daq.results.noise_parameters import ChannelParameters, noise_parameters, quantisation_shares
 from tui.output.noise_parameters import (
@@ -19,13 +18,13 @@ from tui.output.noise_parameters import (
 )
 from tui.page import drawing
 from tui.page.blocks import Items, Paragraph, Part, Plot, Section, three_to_a_row
+from tui.page.ticks import set_log_ticks
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
+    from tui.page.axes import Axes
 
 HEIGHT = 0.8
 
@@ -40,9 +39,6 @@ class _AllanPanel:
     scale: tuple[float, float]
 
     def __call__(self, axes: Axes) -> None:
-        axes.set_title(self.name)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
         for number, each in enumerate(self.channels):
             if each.allan is None:
                 continue
@@ -61,16 +57,22 @@ class _AllanPanel:
                 lw=0.9,
                 label=each.label.channel,
             )
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter(
-            FuncFormatter(lambda value, _: power_of_ten(math.log10(value)))
+        times = np.concatenate([each.allan.tau for each in self.channels if each.allan is not None])
+        room = max(1.1, (times.max() / times.min()) ** 0.05)
+        span = float(times.min() / room), float(times.max() * room)
+        axes.set(
+            title=self.name,
+            xscale="log",
+            yscale="log",
+            xlim=span,
+            ylim=self.scale,
+            xlabel="averaging time (s)",
+            ylabel=f"σ ({self.unit})",
         )
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.set_ylim(self.scale)
-        axes.set_xlabel("averaging time (s)")
-        axes.set_ylabel(f"σ ({self.unit})")
+        set_log_ticks(axes.xaxis, *span, "{:g}".format, digits=(1, 2, 5))
+        set_log_ticks(
+            axes.yaxis, *self.scale, lambda at: power_of_ten(math.log10(at)), has_minor=False
+        )
 
 
 def parameters_section(result: Result) -> Section | None:

@@ -17,6 +17,7 @@ from estimator.wording import span
 from tui.page import drawing
 from tui.page.blocks import Paragraph, Part, Plot, Section, three_to_a_row
 from tui.page.table import Table
+from tui.page.ticks import even_ticks
 from tui.report.figures.curves import logarithmic
 from tui.report.noise import band_tables
 from tui.wording.formatting import NOTHING, level, plain_number, scientific
@@ -24,13 +25,13 @@ from tui.wording.formatting import NOTHING, level, plain_number, scientific
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from daq.bench.model import Bench
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
     from estimator.types import FloatArray
+    from tui.page.axes import Axes
 
 COLUMNS, MOST_LETTERS = 9, 108
 """Channels that one table is wide, and letters of their names."""
@@ -201,21 +202,26 @@ class _Range:
     scale: tuple[float, float]
 
     def __call__(self, axes: Axes) -> None:
-        axes.set_title(f"Sensor {self.sensor}")
         logarithmic(axes, (float(self.centres[0]) / HALF, float(self.centres[-1]) * HALF))
         ends = np.append(self.centres / HALF, self.centres[-1] * HALF)
+        steps = np.repeat(ends, 2)[1:-1]
         for number, name in enumerate(self.names):
-            dashes = ("-", (0, (4, 1.5)), ":")[number % 3]  # told apart without colours, too
+            dashes = [(), (4, 1.5), (1, 1.65)][number % 3]  # told apart without colours, too
             colour = drawing.LINES[number % len(drawing.LINES)]
-            values = self.rms_db[:, number]
-            axes.stairs(values, ends, baseline=None, color=colour, ls=dashes, lw=1.0, label=name)
+            values = np.repeat(self.rms_db[:, number], 2)
+            axes.plot(
+                steps, values, color=colour, dashes=dashes or (None, None), lw=1.0, label=name
+            )
         clips = self.full_db[np.isfinite(self.full_db)]
         if clips.size:
-            axes.axhline(
-                float(clips.min()), color=drawing.LIMIT, lw=1.0, ls="-.", label="sine of full scale"
-            )  # told apart from dashed channels in grey, too
-        axes.set_ylim(self.scale)
-        axes.set_ylabel(f"dB re 1 {self.unit} rms")
+            level = np.full(2, clips.min())
+            dashes = (6.4, 1.6, 1, 1.6)  # told apart from dashed channels in grey, too
+            label = "sine of full scale"
+            axes.plot(ends[[0, -1]], level, color=drawing.LIMIT, lw=1.0, dashes=dashes, label=label)
+        ylabel = f"dB re 1 {self.unit} rms"
+        axes.set(title=f"Sensor {self.sensor}", ylim=self.scale, ylabel=ylabel)
+        levels = even_ticks(*self.scale, 6)
+        axes.yaxis.set_ticks(levels, [f"{each:.0f}".replace("-", "−") for each in levels])
 
 
 def _diagrams(

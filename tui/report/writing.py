@@ -13,7 +13,6 @@ from daq.errors import HuddleError
 from daq.results.result import Result
 from daq.whole_file import write_whole
 from tui.page.blocks import Report
-from tui.page.html_page import page
 from tui.report.contents import report_of
 
 Taken: TypeAlias = Literal["refuse", "replace", "beside"]
@@ -107,6 +106,8 @@ def _free(path: Path, content: bytes) -> Path:
 def written(report: Report, suffix: str) -> bytes:
     """Return a report as the content of a file with this suffix."""
     if suffix.lower() not in PAPER:
+        from tui.page.html_page import page  # noqa: PLC0415 - loads jinja2
+
         return page(report).encode("utf-8")
     from tui.page.pdf import write_paper  # noqa: PLC0415 - loads fpdf2
 

@@ -260,10 +260,7 @@ async def test_the_palette_does_what_the_keys_do(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
-async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
+async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     keys: list[str] = []
 

@@ -16,14 +16,6 @@ from tui.page.blocks import Report
 from tui.page.pdf import write_paper
 
 
-@pytest.fixture(scope="module", autouse=True)
-def empty_figures() -> Iterator[None]:
-    """Leave figures empty: curves take most of a certificate's time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
-        yield
-
-
 @pytest.fixture(scope="module")
 def short_pages() -> Iterator[None]:
     """Leave sections out of certificates: to set them takes most of the time of their tests."""

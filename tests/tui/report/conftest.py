@@ -33,4 +33,5 @@ def paper(reported: Reported) -> PdfReader:
 @pytest.fixture
 def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave figures empty, for tests of the rest: curves take most of a report's time."""
-    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
+    for place in ("drawing", "axes"):
+        monkeypatch.setattr(f"tui.page.{place}.draw", lambda *_, **__: None)

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from pypdf import PageObject, PdfReader
 from pypdf.generic import Destination
 
 from tests.command import huddle
 from tests.tui.night_recording import RATE
 from tests.tui.report.written_report import Reported, Words, paper_of, result_of, texts_of
+from tui.page import drawing
+from tui.page.axes import Axes
 from tui.page.blocks import KeyValues, Paragraph, Plot, Report, Section
 from tui.page.drawing import WIDTH
 from tui.page.table import Table
+from tui.page.ticks import even_ticks, set_log_ticks
 from tui.report.contents import report_of
 from tui.report.writing import write
 
@@ -148,7 +151,7 @@ def test_a_pass_of_two_minutes_has_its_result_on_page_one_and_four_pages(tmp_pat
 
 def test_axes_above_others_have_labels_if_a_page_ends_between_them() -> None:
     def panel(axes: Axes) -> None:
-        axes.set_xlabel("time (s)")
+        axes.set(xlabel="time (s)")
 
     plots = [Plot("", (panel,), 1, 2.5, "a plot", is_continued=n < 5) for n in range(6)]
     section = Section("One", tuple(plots))
@@ -160,13 +163,11 @@ def test_axes_above_others_have_labels_if_a_page_ends_between_them() -> None:
 
 def test_curves_are_paths_where_the_axes_have_them() -> None:
     at, level = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.5, 2.5, np.nan, 1.0])
-    places = []
 
     def panel(axes: Axes) -> None:
         axes.fill_between(at, at - 4, at, color="#ff0000", alpha=0.25, lw=0)
         axes.plot(at, level, color="#0000ff", lw=1.5, dashes=(4, 2))
         axes.set(xlim=(1, 4), ylim=(0, 2), xlabel="time ($s$)", ylabel="height")
-        places.append(axes.get_position())
 
     plot = Plot("", (panel,), n_columns=1, height=1.0, alt="a curve")
     report = Report("Plots", "", Paragraph("drawn"), (Section("One", (plot,)),))
@@ -185,36 +186,67 @@ def test_curves_are_paths_where_the_axes_have_them() -> None:
     assert found is not None
     assert clip is not None
     x, y, width, height = map(float, clip.groups())
-    assert (width, height) == pytest.approx(
-        (72 * places[0].width * WIDTH, 72 * 0.8 * plot.height), abs=0.01
-    )
+    inner = WIDTH - drawing.LEFT - plot.right
+    assert (width, height) == pytest.approx((72 * inner, 72 * 0.8 * plot.height), abs=0.01)
     points = np.array(found.groups(), float).reshape(2, 2)
     shown = [(x, y + 0.25 * height), (x + width / 3, y + 1.25 * height)]
     np.testing.assert_allclose(points, shown, atol=0.01)
     assert any(" 1 0 0 rg" in line and line.endswith("f Q") for line in words)
 
 
-def test_curves_of_three_and_four_points_are_drawn() -> None:
-    """As arrows and round ends have them: pen down at one end, and lifted at the other."""
-
+def test_markers_stand_at_their_points_and_cells_have_the_colours_of_the_map() -> None:
     def panel(axes: Axes) -> None:
-        bent = {"arrowstyle": "-|>", "connectionstyle": "arc3,rad=0.5", "color": "#00ff00"}
-        axes.annotate("", (1.0, 1.0), (0.0, 0.0), arrowprops=bent)
-        axes.plot([0.5], [0.5], "o", color="#0000ff")
-        axes.set(xlim=(0, 1), ylim=(0, 1))
+        draw = partial(axes.plot, [0.5, np.nan], [0.5, 0.5], ls="", color="#0000ff", ms=4.0)
+        draw(marker="x")
+        draw(marker="o", mfc="none")
+        cells = np.array([[0.0, np.nan], [1.0, 2.0]])
+        edges = np.array([1.0, 10.0, 100.0])
+        axes.pcolormesh(edges, np.arange(3.0), cells, cmap="viridis", vmin=0.0, vmax=2.0)
+        axes.set(xlim=(0.0, 1.0), ylim=(0.0, 2.0))
 
-    plot = Plot("", (panel,), n_columns=1, height=1.0, alt="an arrow")
+    plot = Plot("", (panel,), n_columns=1, height=1.0, alt="a map")
     report = Report("Plots", "", Paragraph("drawn"), (Section("One", (plot,)),))
     content = PdfReader(paper_of(report)).pages[0].get_contents()
     assert content is not None
     lines = content.get_data().decode("latin-1").splitlines()
-    (bend, *_) = (line for line in lines if " 0 1 0 RG" in line and " c " in line)
-    numbers = re.findall(r"[-\d.]+ [-\d.]+", bend.split(" m ")[1])
-    first, second, last = (np.array(each.split(), float) for each in numbers[:3])
-    start = np.array(re.findall(r"([-\d.]+) ([-\d.]+) m ", bend)[0], float)
-    corner = (3 * first - start) / 2  # of the curve of three points
-    np.testing.assert_allclose(corner, (3 * second - last) / 2, atol=0.01)
-    assert any(" 0 0 1 rg" in line and line.count(" c ") == 8 for line in lines)
+    x, y, width, height = next(
+        map(float, found.groups())
+        for line in lines
+        if (found := re.search(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re W n", line))
+    )
+    cross, ring = (line for line in lines if " 0 0 1 RG 1 w" in line)
+    for drawn, n_lines in ((cross, 2), (ring, 1)):
+        numbers = re.findall(r"([\d.]+) ([\d.]+) [ml]", drawn)
+        points = np.array(numbers, float)
+        assert drawn.count(" m ") == n_lines
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        np.testing.assert_allclose(middle, [x + width / 2, y + height / 4], atol=0.01)
+        np.testing.assert_allclose(np.ptp(points, axis=0), 4.0, atol=0.02)
+    filled = [line.split(" rg")[0].split("n ")[-1] for line in lines if line.endswith(" f Q")]
+    colours = [[round(255 * float(part)) for part in each.split()] for each in filled]
+    assert colours == [[68, 1, 84], [33, 145, 140], [253, 231, 37]]
+
+
+def test_ticks_are_round_numbers_between_both_ends() -> None:
+    assert even_ticks(-70, -10, 6) == [-70, -60, -50, -40, -30, -20, -10]
+    assert even_ticks(0.13, 0.94, 4) == pytest.approx([0.5])
+    assert even_ticks(0.0, 3600.0, 8, (1, 1.5, 2, 3, 5, 6)) == list(range(0, 3601, 500))
+    found: dict[bool, list[float]] = {}
+
+    class Recorded:
+        def set_ticks(self, ticks: list[float], labels: list[str], *, minor: bool = False) -> None:
+            assert len(ticks) == len(labels)
+            found[minor] = ticks
+
+    set_log_ticks(Recorded(), 0.1, 100.0, str)
+    assert found == {
+        False: pytest.approx([0.1, 1, 10, 100]),
+        True: pytest.approx([d * 10.0**e for e in (-1, 0, 1) for d in range(2, 10)]),
+    }
+    set_log_ticks(Recorded(), 12.0, 80.0, str)  # a decade holds no two powers of ten
+    assert found[False] == pytest.approx([20, 50])
+    set_log_ticks(Recorded(), 1e-6, 1.2, str, most=4, has_minor=False)
+    assert found == {False: pytest.approx([1e-6, 1e-4, 1e-2, 1.0]), True: []}
 
 
 def test_tables_of_the_annex_stand_side_by_side_where_they_fit() -> None:

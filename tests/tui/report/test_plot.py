@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -230,7 +231,7 @@ def test_what_cannot_be_drawn_is_refused_before_the_estimate(
 def test_minor_ticks_as_one_line_look_as_those_of_matplotlib(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def panel(axes: Axes) -> None:
+    def panel(axes: Any) -> None:  # noqa: ANN401 - those of matplotlib
         axes.loglog([0.03, 70.0], [2.2, 5.0])  # less than a decade has labels at minor ticks
 
     plot = Plot("", (panel, panel), n_columns=2, height=1.5, alt="two lines")

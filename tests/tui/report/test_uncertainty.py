@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from daq.bench.model import DataSheet
 from daq.recording.reader import Recording
@@ -16,6 +15,7 @@ from daq.results.result import Result
 from daq.results.uncertainty_budget import band_budgets
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.report.written_report import Reported, by_channel, tables
+from tui.page.axes import Axes
 from tui.page.blocks import Paragraph, Plot
 from tui.page.table import Table
 from tui.report.uncertainty import half_octaves, uncertainty_section
@@ -108,9 +108,9 @@ def test_the_range_reaches_from_the_noise_to_a_sine_of_full_scale(reported: Repo
     section = uncertainty_section(result, about["g"])
     assert section is not None
     (plot,) = (part for part in section.parts if isinstance(part, Plot) and part.title)
-    axes = Figure().subplots()
+    axes = Axes((0.0, 0.0, 1.0, 1.0))
     plot.panels[0](axes)
-    assert axes.get_ylabel() == "dB re 1 m/s² rms"
+    assert axes.yaxis.label == "dB re 1 m/s² rms"
     rms, reach = [part for part in section.parts if isinstance(part, Table)][2:4]
     column = rms.header.index("A.X")
     for noise, range_db in zip(rms.rows, reach.rows, strict=True):

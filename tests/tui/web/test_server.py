@@ -123,11 +123,7 @@ def test_the_downloads_are_those_of_the_command(server: Server, folder: Path) ->
     assert visit.get("/tests/night.h5/report.pdf").content.startswith(b"%PDF-")
 
 
-def test_certificates_of_a_test_are_read(
-    server: Server, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Curves take most of a certificate's time.
-    monkeypatch.setattr("tui.page.drawing.draw", lambda *_, **__: None)
+def test_certificates_of_a_test_are_read(server: Server, folder: Path) -> None:
     recording = folder / "recordings" / "night.h5"
     assert "Certificate" not in server.visit().get("/tests/night.h5").text
     with Recording.open(recording) as opened:

@@ -9,10 +9,7 @@ from functools import partial
 from itertools import cycle, groupby
 from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from daq.bench.units import levels_db
 from daq.results.decision.limits import concerns, mask_psd
@@ -23,13 +20,13 @@ from estimator.self_noise.result import Flag, SelfNoise
 from tui.page import drawing
 from tui.page.blocks import Plot
 from tui.page.drawing import WIDTH, look, stack, stack_height
+from tui.page.ticks import even_ticks, set_log_ticks
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from daq.bench.masks.mask import Mask
@@ -37,6 +34,7 @@ if TYPE_CHECKING:
     from daq.results.band_summary import BandMeans
     from daq.results.result import Result
     from estimator.types import FloatArray
+    from tui.page.axes import Axes
 
     BoolArray = NDArray[np.bool_]
 
@@ -84,7 +82,7 @@ class _NoisePanel:
     def __call__(self, axes: Axes) -> None:
         curve, scale = self.curve, self.scale
         frequency = curve.frequency
-        axes.set_title(self.name)
+        axes.set(title=self.name, ylim=scale, ylabel=f"dB re 1 ({self.unit})²/Hz")
         logarithmic(axes, (float(curve.edges[0]), float(curve.edges[-1])))
         line = partial(axes.plot, lw=0.8)
         line(frequency, levels_db(curve.data), color=drawing.DATA, label="recorded")
@@ -108,10 +106,8 @@ class _NoisePanel:
             axes.axvline(edge, color=drawing.INK, lw=0.5, dashes=(1, 2))
         if curve.noise is not None:
             _nothing(axes, curve.edges, curve.noise)
-        axes.set_ylim(scale)
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.0f}".replace("-", "−"))
-        axes.set_ylabel(f"dB re 1 ({self.unit})²/Hz")
+        levels = even_ticks(*scale, 6)
+        axes.yaxis.set_ticks(levels, [f"{each:.0f}".replace("-", "−") for each in levels])
         if self.with_amplitude:
             _amplitude_scale(axes, scale, self.unit)
 
@@ -318,13 +314,10 @@ def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
     """Show the root of the PSD at the right."""
     other = axes.twinx()
     other.grid(visible=False)
-    other.spines[:].set_visible(False)
-    other.set_ylim(scale)
+    other.set(frame_on=False, ylim=scale, ylabel=f"({unit})/√Hz")
     step = 20 * max(1, math.ceil((scale[1] - scale[0]) / 120))
-    first = math.ceil(scale[0] / step) * step
-    other.set_yticks(np.arange(first, scale[1] + 1, step))
-    other.yaxis.set_major_formatter(lambda value, _: power_of_ten(value / 20))
-    other.set_ylabel(f"({unit})/√Hz")
+    levels = np.arange(math.ceil(scale[0] / step) * step, scale[1] + 1, step)
+    other.yaxis.set_ticks(levels.tolist(), [power_of_ten(level / 20) for level in levels])
 
 
 def _nothing(axes: Axes, edges: FloatArray, noise: BandMeans) -> None:
@@ -351,11 +344,8 @@ def _runs(true: BoolArray) -> Iterator[tuple[int, int]]:
 
 def logarithmic(axes: Axes, span: tuple[float, float]) -> None:
     """Make the horizontal axis one of frequency."""
-    axes.set_xscale("log")
-    axes.set_xlim(span)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("frequency (Hz)")
+    axes.set(xscale="log", xlim=span, xlabel="frequency (Hz)")
+    set_log_ticks(axes.xaxis, *span, "{:g}".format)
 
 
 _LEAST_SENSORS = 2
@@ -414,6 +404,9 @@ def write_plots(plots: Sequence[Plot], path: Path, *, width: float, title: str) 
     OSError
         If the file cannot be written; an earlier one stays.
     """
+    import matplotlib as mpl  # noqa: PLC0415 - takes a third of a second
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     kind = path.suffix.lower().removeprefix(".")
     about: dict[str, str | None] = {"Title": title, **_ABOUT[kind]}
     content = io.BytesIO()

@@ -7,17 +7,16 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from daq.results.clock_effect import lags
 from tui.page import drawing
 from tui.page.blocks import Plot
+from tui.page.ticks import even_ticks
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from daq.estimation.snapshot import Snapshot
     from estimator.types import FloatArray
+    from tui.page.axes import Axes
 
 POINTS = 400
 HEIGHT = 1.5
@@ -85,15 +84,22 @@ def _draw(seconds: FloatArray, left: FloatArray, names: list[str], axes: Axes) -
         dashes = [(), (4, 1.5), (1, 1)][number % 3]  # told apart without colours, too
         colour = drawing.LINES[number % len(drawing.LINES)]
         axes.plot(time, size * column, color=colour, dashes=dashes or (None, None), label=name)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 1.5, 2, 3, 5, 6, 10]))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_xlim(0, float(time[0] + time[-1]))
-    if largest < NEGLIGIBLE:
-        axes.set_ylim(-size * NEGLIGIBLE, size * NEGLIGIBLE)
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
-    axes.set_xlabel(f"time since the first sample ({word})")
-    axes.set_ylabel(f"drift ({unit})")
+    end = float(time[0] + time[-1])
+    ends = size * float(np.nanmin(left)), size * float(np.nanmax(left))
+    room = 0.05 * (ends[1] - ends[0])
+    half = size * NEGLIGIBLE
+    ylim = (-half, half) if largest < NEGLIGIBLE else (ends[0] - room, ends[1] + room)
+    axes.set(
+        xlim=(0.0, end),
+        ylim=ylim,
+        xlabel=f"time since the first sample ({word})",
+        ylabel=f"drift ({unit})",
+    )
+    for axis, ticks in (
+        (axes.xaxis, even_ticks(0.0, end, 8, (1, 1.5, 2, 3, 5, 6))),
+        (axes.yaxis, even_ticks(*ylim, 6)),
+    ):
+        axis.set_ticks(ticks, [f"{each:g}".replace("-", "−") for each in ticks])
 
 
 def _names_by_clock(snapshot: Snapshot, drift: FloatArray) -> dict[int, str]:

@@ -7,20 +7,19 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import LogLocator, NullLocator
 
 from estimator.levels.bands import log_edges
 from estimator.likelihood.goodness_of_fit import REJECT, critical_value, neighbour_correlation
 from estimator.spectra.windows import get_window
 from tui.page import drawing
 from tui.page.blocks import Plot
+from tui.page.ticks import set_log_ticks
 from tui.report.figures.curves import centres, logarithmic
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from daq.results.result import Result
     from estimator.types import FloatArray
+    from tui.page.axes import Axes
 
 TEST_POINTS = 90
 TEST_HEIGHT = 1.25
@@ -69,7 +68,6 @@ def _draw_test(
     centre: FloatArray, ratio: FloatArray, limit: FloatArray, span: tuple[float, float], axes: Axes
 ) -> None:
     logarithmic(axes, span)
-    axes.set_yscale("log")
     failing = ratio > limit
     axes.plot(centre, limit, color=drawing.LIMIT, lw=0.9, dashes=(5, 2), label="1 % limit")
     draw = partial(axes.plot, ls="", clip_on=False)
@@ -80,8 +78,6 @@ def _draw_test(
         draw(*fails, marker="D", ms=2.6, color=drawing.LIMIT, label="not explained")
     finite = np.concatenate([ratio[ratio > 0], limit[np.isfinite(limit)], [1.0]])
     finite = finite[np.isfinite(finite)]
-    axes.set_ylim(min(0.7, 0.9 * finite.min()), max(1.6, 1.25 * finite.max()))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_ylabel("statistic / expected")
+    ends = min(0.7, 0.9 * float(finite.min())), max(1.6, 1.25 * float(finite.max()))
+    axes.set(yscale="log", ylim=ends, ylabel="statistic / expected")
+    set_log_ticks(axes.yaxis, *ends, "{:g}".format, digits=(1, 2, 5), has_minor=False)

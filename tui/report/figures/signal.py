@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from daq.protocols.block import EventKind
 from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Signal, Spectrogram, Trace, Waveforms
@@ -19,9 +18,8 @@ from tui.wording.signal import extent, moment, time_ticks, title
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from matplotlib.axes import Axes
-
     from daq.estimation.snapshot import Snapshot
+    from tui.page.axes import Axes
 
 COLUMNS, TIMES, BANDS, TICKS = 1200, 160, 60, 6
 COARSE = 24, 30
@@ -101,9 +99,8 @@ def _spectra(
 
 def _time_axis(axes: Axes, span: tuple[float, float], most: int = TICKS) -> None:
     ticks = dict(time_ticks(*span, most))
-    axes.set_xlim(*span)
-    axes.xaxis.set_major_locator(FixedLocator(list(ticks)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda at, _: ticks.get(at, "")))
+    axes.set(xlim=span)
+    axes.xaxis.set_ticks(list(ticks), list(ticks.values()))
 
 
 def _draw_waveforms(view: Waveforms, axes: Axes) -> None:
@@ -115,23 +112,23 @@ def _draw_waveforms(view: Waveforms, axes: Axes) -> None:
             _CYCLE * low - row,
             _CYCLE * high - row,
             color=drawing.NOISE if not trace.is_auxiliary else drawing.DATA,
-            linewidth=0.4,
+            lw=0.4,
         )
     for row, trace in enumerate(view.traces):
-        across = "axes fraction", "data"
-        axes.annotate(extent(trace), (1.005, -row), xycoords=across, va="center", size=5)
+        right = view.end + 0.005 * (view.end - view.begin)
+        axes.text(right, -row, extent(trace), va="center", size=5)
     for mark in view.marks:
         _draw_mark(axes, mark, (view.end - view.begin) / view.n_columns)
     remarks = [mark for mark in view.marks if mark.kind == EventKind.MARK]
     for number, mark in enumerate(remarks[:_MOST_REMARKS]):
-        axes.annotate(f" {mark.text}", (mark.begin, 0.95 - 0.22 * (number % 2)), va="top", size=5.5)
-    axes.set_ylim(-len(view.traces) + 0.5, 1.0)
-    axes.yaxis.set_major_locator(FixedLocator([-row for row in range(len(view.traces))]))
+        above = 0.95 - 0.22 * (number % 2)
+        axes.text(mark.begin, above, f" {mark.text}", va="top", size=5.5)
     names = [trace.name for trace in view.traces]
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: names[round(-at)]))
+    axes.yaxis.set_ticks([-row for row in range(len(names))], names)
     axes.grid(visible=False, axis="y")
     _time_axis(axes, (view.begin, view.end), 2 * TICKS)
-    axes.set_xlabel(f"UTC, from {moment(view.begin)[:10]}")
+    xlabel = f"UTC, from {moment(view.begin)[:10]}"
+    axes.set(ylim=(-len(view.traces) + 0.5, 1.0), xlabel=xlabel)
 
 
 def _draw_mark(axes: Axes, mark: Mark, column: float) -> None:
@@ -155,10 +152,10 @@ class _Spectrum:
 
     def __call__(self, axes: Axes) -> None:
         found, (low, high) = self.found, self.found.range_db
-        axes.set_title(f"{self.name}, {low:.0f} to {high:.0f} dB".replace("-", "−"))
+        height = np.log10(found.frequency)
         axes.pcolormesh(
             found.times,
-            np.log10(found.frequency),
+            height,
             found.level_db.T,
             cmap="viridis",
             vmin=low,
@@ -166,11 +163,8 @@ class _Spectrum:
             rasterized=self.is_fine,
         )
         axes.grid(visible=False)
-        ends = np.log10(found.frequency[[0, -1]])
-        decades = range(math.ceil(ends[0]), math.floor(ends[1]) + 1)
-        axes.set_ylim(*ends)
-        axes.yaxis.set_major_locator(FixedLocator(list(decades)))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda at, _: f"{10.0**at:g}"))
-        axes.set_ylabel("Hz")
+        title = f"{self.name}, {low:.0f} to {high:.0f} dB".replace("-", "−")
+        axes.set(title=title, ylim=(height[0], height[-1]), ylabel="Hz")
+        decades = range(math.ceil(height[0]), math.floor(height[-1]) + 1)
+        axes.yaxis.set_ticks(decades, [f"{10.0**each:g}" for each in decades])
         _time_axis(axes, self.span, TICKS // 2)
