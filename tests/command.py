@@ -1,7 +1,9 @@
-"""The command, run in the process of a test."""
+"""The command, run in the process of a test, and code in a process of its own."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 from typer.testing import CliRunner, Result
@@ -19,3 +21,9 @@ def huddle(*arguments: object, code: int = 0, **options: Any) -> Result:  # noqa
 def printed(*arguments: object, code: int = 0) -> str:
     """Return what the command writes to a terminal of 200 columns."""
     return huddle(*arguments, code=code, terminal_width=200).stdout
+
+
+def modules_after(code: str) -> set[str]:
+    """Return the names of the modules that are loaded after code ran in a new interpreter."""
+    run = [sys.executable, "-c", f"import sys; {code}\nprint(*sys.modules)"]
+    return set(subprocess.run(run, capture_output=True, text=True, check=True).stdout.split())

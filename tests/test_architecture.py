@@ -4,25 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
-import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 from sim_devices.server.serve import FAMILIES
-
-
-def modules_after(statement: str) -> set[str]:
-    """Names of the modules loaded in a fresh interpreter after the statement."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; {statement}; print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return set(done.stdout.split())
+from tests.command import modules_after
 
 
 def test_package_roots_import_nothing() -> None:

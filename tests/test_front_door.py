@@ -18,7 +18,7 @@ import pytest
 import huddle
 from daq.bench.estimate_settings import table_keys
 from daq.python_process import python_command
-from tests.test_architecture import modules_after
+from tests.command import modules_after
 from tui.notebook import estimates, planning, recording, simulation, verbs
 from tui.notebook.options import EstimateOptions
 

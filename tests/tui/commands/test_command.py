@@ -26,7 +26,7 @@ from daq.preflight.device_check import SensorCheck
 from daq.python_process import python_command
 from docs import reference
 from sim_devices.world.paper_scenarios import SCENARIOS
-from tests.command import huddle, printed
+from tests.command import huddle, modules_after, printed
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
 from tui.commands.main import app, main
@@ -34,13 +34,6 @@ from tui.output.plain_console import PlainConsole
 from tui.studies.reproduce import STUDIES
 
 ROOT = Path(__file__).parents[3]
-
-
-def modules_after(code: str) -> set[str]:
-    """Names of the modules loaded after running code in a new interpreter."""
-    code += "; import sys; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return set(done.stdout.split())
 
 
 def samples(names: Iterable[str] = "ABC", n_channels: int = 3) -> dict[str, NDArray[np.float64]]:
