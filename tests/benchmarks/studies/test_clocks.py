@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks.studies.clocks import free_running, residuals, study
 from benchmarks.studies.synthesis import Latency, synthesise
@@ -17,7 +16,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.results.result import Result
 from sim_devices.world.scenario import Scenario
-from tui.commands.main import app
+from tests.command import huddle
 
 LATENCIES = pytest.mark.parametrize(
     "latency",
@@ -49,8 +48,7 @@ def test_the_command_takes_samples_at_face_value_only_if_told(tmp_path: Path) ->
     told = {}
     for clocks in ("refined", "nominal"):
         asked = ["estimate", str(path), "--segment", "2s", "--clocks", clocks, "--json", "-"]
-        result = CliRunner().invoke(app, asked)
-        assert result.exit_code == 0, result.output
+        result = huddle(*asked)
         told[clocks] = json.loads(result.stdout)["diagnostics"]
     sources = {clocks: {each["source"] for each in told[clocks]["clocks"]} for clocks in told}
     assert sources == {"refined": {"arrival times"}, "nominal": {"nominal rate"}}

@@ -27,6 +27,7 @@ from daq.results.calibration import calibrate
 from daq.results.result import Result
 from daq.results.uncertainty_budget import Budget, Component, student_quantile
 from estimator.responses.derived_quantities import Value
+from tests.command import huddle
 from tests.daq.clocks.recordings import Sensor, write
 from tests.tui.schemas import validate
 from tui.commands.calibrate import side_by_side
@@ -344,10 +345,7 @@ def test_what_widens_the_interval_is_in_the_budget_of_the_noise(snapshot: Snapsh
 
 
 def test_the_command_says_it_all(recording: Path) -> None:
-    result = CliRunner().invoke(
-        app, ["calibrate", str(recording), "--segment", "2s", "--band", "1:20", "--json", "-"]
-    )
-    assert result.exit_code == 0, result.output
+    result = huddle("calibrate", recording, "--segment", "2s", "--band", "1:20", "--json", "-")
     found = json.loads(result.stdout)
     validate("calibration-1", found)
     assert found["reference"] == "a"

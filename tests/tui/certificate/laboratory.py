@@ -14,6 +14,7 @@ from cryptography.x509.oid import NameOID
 from pypdf import PdfReader
 from typer.testing import CliRunner
 
+from tests.command import huddle
 from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
 from tui.commands.main import app
 
@@ -56,8 +57,7 @@ class Laboratory:
         """Issue a certificate; a channel is dead: not decided, and invalid without a reason."""
         arguments = ["issue", str(self.recording), "--by", by, "--bench", str(self.bench)]
         arguments += ["--despite", DESPITE, *more]
-        found = CliRunner().invoke(app, arguments)
-        assert found.exit_code == 4, found.output
+        found = huddle(*arguments, code=4)
         return found.output
 
     def verify(self, *files: Path | str) -> tuple[int, str]:

@@ -27,6 +27,7 @@ from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
 from daq.recording.repair import write_results
 from daq.recording.signing import identity, make_key, sign
+from tests.command import huddle
 from tests.tui.certificate.laboratory import CALIBRATED, Laboratory, laboratory, text_of
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, assert_as_kept, lines_of
@@ -141,8 +142,7 @@ def test_the_dcc_is_valid_by_the_schema_of_the_ptb(issued: Laboratory, tmp_path:
     content = PdfReader(issued.certificate()).attachments[NAME][0]
     schema.assertValid(etree.parse(io.BytesIO(content)))
     draft = tmp_path / "draft.xml"
-    found = CliRunner().invoke(app, ["report", str(issued.recording), "--out", str(draft)])
-    assert found.exit_code == 4, found.output
+    huddle("report", issued.recording, "--out", draft, code=4)
     tree = etree.parse(draft)
     schema.assertValid(tree)
     assert tree.xpath("//dcc:statement[contains(., 'DRAFT')]", namespaces=NAMESPACES)
@@ -214,8 +214,7 @@ def test_the_files_inside_have_the_numbers_of_the_page(issued: Laboratory) -> No
 
 def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -> None:
     again = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
-    refused = CliRunner().invoke(app, [*again, "--despite", "a test"])
-    assert refused.exit_code == 2
+    refused = huddle(*again, "--despite", "a test", code=2)
     assert "--reason" in refused.stderr
     before = copied.certificate().read_bytes()
     copied.issue("--segment", "2s", "--reason", "finer bins")
@@ -240,14 +239,12 @@ def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -
 
 def test_what_is_not_given_is_refused_unless_allowed(tmp_path: Path) -> None:
     recording = record(tmp_path / "night.h5", stated=", tolerance = 0.02")
-    run, command = CliRunner(), ["issue", str(recording), "--by", "Ada", "--despite", "a test"]
-    refused = run.invoke(app, command)
-    assert refused.exit_code == 2
+    command = ["issue", str(recording), "--by", "Ada", "--despite", "a test"]
+    refused = huddle(*command, code=2)
     for asked in ("[laboratory] name", "[customer] name", "[certificate] procedure"):
         assert asked in " ".join(refused.stderr.split())
     assert not (tmp_path / "certificates").exists()
-    allowed = run.invoke(app, [*command, "--allow-incomplete"])
-    assert allowed.exit_code == 4, allowed.output
+    huddle(*command, "--allow-incomplete", code=4)
     (path,) = (tmp_path / "certificates").glob("HT-*.pdf")
     assert "Issuedincomplete.Notgiven:nameandaddressofthelaboratory" in text_of(path)
 
@@ -255,20 +252,18 @@ def test_what_is_not_given_is_refused_unless_allowed(tmp_path: Path) -> None:
 def simulated(folder: Path) -> Path:
     recording = folder / "s.h5"
     arguments = ["simulate", "fig4", "--duration", "20s", "--out", str(recording)]
-    assert CliRunner().invoke(app, arguments).exit_code == 0
+    huddle(*arguments)
     return recording
 
 
 def test_of_simulated_sensors_there_are_specimens_alone(tmp_path: Path) -> None:
-    recording, run = simulated(tmp_path), CliRunner()
+    recording = simulated(tmp_path)
     arguments = ["issue", str(recording), "--by", "Ada", "--allow-incomplete", "--despite", "x"]
-    found = run.invoke(app, arguments)
-    assert found.exit_code == 2
+    found = huddle(*arguments, code=2)
     assert "simulated" in found.stderr
     assert not (tmp_path / "certificates").exists()
     place = tmp_path / "an absent folder"
-    found = run.invoke(app, ["issue", str(recording), "--specimen", "--folder", str(place)])
-    assert found.exit_code == 0, found.output
+    found = huddle("issue", recording, "--specimen", "--folder", place)
     assert not (tmp_path / "certificates").exists()
     path = place / "s-specimen.pdf"
     pages = ["".join(page.extract_text().split()) for page in PdfReader(path).pages]
@@ -284,8 +279,7 @@ def test_of_simulated_sensors_there_are_specimens_alone(tmp_path: Path) -> None:
         assert tree.xpath(f"//dcc:statement[contains(., '{word}')]", namespaces=NAMESPACES)
     assert "Dateofissuenotissued" in "".join(pages)
     assert "Entryoftheledger" not in "".join(pages)
-    found = run.invoke(app, ["verify", str(path)])
-    assert found.exit_code == 3
+    found = huddle("verify", path, code=3)
     assert "a specimen, no certificate" in " ".join((found.output + found.stderr).split())
 
 
@@ -294,8 +288,7 @@ def test_a_result_that_a_fact_invalidates_needs_a_reason(
 ) -> None:
     arguments = ["issue", str(issued.recording), "--by", "Ada", "--bench", str(issued.bench)]
     elsewhere = ["--folder", str(tmp_path / "papers")]
-    refused = CliRunner().invoke(app, [*arguments, *elsewhere, "--allow-incomplete"])
-    assert refused.exit_code == 2
+    refused = huddle(*arguments, *elsewhere, "--allow-incomplete", code=2)
     said = " ".join(refused.stderr.split())
     assert "the result is invalid" in said
     assert "no signal; check cable and power" in said
@@ -352,8 +345,7 @@ def test_no_certificate_is_issued_of_what_verify_refuses(
     assert code == 3
     assert said in words
     arguments = ["issue", str(made.recording), "--by", "Ada", "--bench", str(made.bench)]
-    refused = CliRunner().invoke(app, [*arguments, "--despite", "whatever"])
-    assert refused.exit_code == 2, refused.output
+    refused = huddle(*arguments, "--despite", "whatever", code=2)
     assert said in " ".join(refused.stderr.split())
     assert not made.certificates.exists()
 
@@ -363,8 +355,7 @@ def test_only_closed_recordings_are_certified(tmp_path: Path) -> None:
     said = []
 
     def issue(path: Path) -> None:
-        refused = CliRunner().invoke(app, ["issue", str(path), "--by", "Ada", "--despite", "x"])
-        assert refused.exit_code == 2
+        refused = huddle("issue", path, "--by", "Ada", "--despite", "x", code=2)
         said.append(" ".join(refused.stderr.split()))
 
     def before_end() -> None:
@@ -387,8 +378,7 @@ def test_no_revision_is_issued_of_a_recording_changed_since_its_certificate(
         write_checksums(file)
         write_manifest(file)
     arguments = ["issue", str(copied.recording), "--by", "Ada", "--bench", str(copied.bench)]
-    refused = CliRunner().invoke(app, [*arguments, "--despite", "x", "--reason", "y"])
-    assert refused.exit_code == 2
+    refused = huddle(*arguments, "--despite", "x", "--reason", "y", code=2)
     assert "changed since certificate PIER-" in " ".join(refused.stderr.split())
 
 

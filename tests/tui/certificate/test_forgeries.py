@@ -23,17 +23,16 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.serialization import pkcs12
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import ContentStream, NameObject
-from typer.testing import CliRunner
 
 from daq.recording.chunks.manifest import write_manifest
 from daq.recording.description import write_checksums
+from tests.command import huddle
 from tests.traced_memory import peak_of
 from tests.tui.certificate.laboratory import Laboratory, key, laboratory
 from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import PdfSignature, Signer, signatures
 from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
-from tui.commands.main import app
 
 pytestmark = pytest.mark.usefixtures("short_pages")
 
@@ -325,8 +324,7 @@ def test_who_does_not_know_the_passphrase_issues_nothing(
     monkeypatch.setenv("HUDDLE_PASSPHRASE", "wrong")
     arguments = ["issue", str(forged.lab.recording), "--by", "Ada", "--reason", "signed"]
     arguments += ["--bench", str(forged.lab.bench), "--sign", str(forged.other)]
-    refused = CliRunner().invoke(app, arguments)
-    assert refused.exit_code == 2
+    refused = huddle(*arguments, code=2)
     assert "passphrase is wrong" in refused.stderr
     assert len(Ledger(forged.lab.certificates).entries()) == 2  # it took no number
 
@@ -379,8 +377,7 @@ def test_a_ledger_without_its_last_rows_hides_no_certificate_of_its_folder(
         assert code == 3
         assert f"the ledger lacks {lacking} of the folder" in said
     again = ["--bench", str(forged.lab.bench), "--despite", "x", "--reason", "y", "--by", "Ada"]
-    refused = CliRunner().invoke(app, ["issue", str(forged.lab.recording), *again])
-    assert refused.exit_code == 2
+    refused = huddle("issue", forged.lab.recording, *again, code=2)
     assert "the ledger" in refused.stderr
 
 

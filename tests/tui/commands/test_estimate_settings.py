@@ -28,8 +28,8 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from estimator.likelihood.factor_analysis import max_factors
 from estimator.spectra.welch import WelchSettings
+from tests import command as commands
 from tui.commands.help import subcommand
-from tui.commands.main import app
 from tui.commands.options import with_estimate_options
 from tui.runs.estimate_settings import check_fit, chosen
 from tui.simulation.write_recording import simulate_recording
@@ -255,8 +255,7 @@ def test_an_estimate_without_options_does_what_the_recordings_bench_file_says(
 
 def huddle(*arguments: str) -> Any:  # noqa: ANN401 - JSON
     """Run a command that succeeds, and return the JSON that it writes last."""
-    result = CliRunner().invoke(app, [*arguments, "--json", "-"])
-    assert result.exit_code == 0, result.output
+    result = commands.huddle(*arguments, "--json", "-")
     return json.loads(result.stdout.splitlines()[-1])
 
 
@@ -279,9 +278,8 @@ def test_options_of_an_import_hold_for_what_is_estimated_from_it(tmp_path: Path)
     assert set(watched["noise"]) == {*METHODS} - {"all", "auto"}
     later = huddle("estimate", out, "--method", "all", "--segment", "1s", "--start", "20s")
     assert watched["segments"] == later["results"][0]["segments"] < estimated["segments"] / 2
-    refused = CliRunner().invoke(
-        app, ["import", str(tmp_path / "a.npz"), "--out", f"{out}.h5", "--gain", "D=2"]
+    refused = commands.huddle(
+        "import", tmp_path / "a.npz", "--out", f"{out}.h5", "--gain", "D=2", code=2
     )
-    assert refused.exit_code == 2
     assert "expected one of A, B, C" in refused.output
     assert not (tmp_path / "a.h5.h5").exists()

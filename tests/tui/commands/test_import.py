@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from daq.bench.estimate_settings import EstimateSettings
 from daq.recording.reader import Recording
+from tests.command import huddle
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
 from tui.commands.main import app
 from tui.output.exit_codes import ExitCode
@@ -24,10 +25,7 @@ def test_the_rest_is_imported_and_what_is_not_is_listed(tmp_path: Path) -> None:
         write_records(tmp_path / "a", counts(600, 1), channel=channel)
     (tmp_path / "b").write_text("no waveforms")
     sources = [str(tmp_path / "a"), str(tmp_path / "b")]
-    found = CliRunner().invoke(
-        app, ["import", *sources, "-o", str(tmp_path / "a.h5"), "--json", "-"]
-    )
-    assert found.exit_code == ExitCode.TROUBLE
+    found = huddle("import", *sources, "-o", tmp_path / "a.h5", "--json", "-", code=3)
     document = json.loads(found.stdout)
     assert [sensor["n_samples"] for sensor in document["sensors"]] == [600]
     assert document["left_aside"] == {"XX.ABC.00.VMZ": "state of health"}
@@ -39,11 +37,9 @@ def test_the_rest_is_imported_and_what_is_not_is_listed(tmp_path: Path) -> None:
 def test_columns_and_the_unit_of_samples_are_said_on_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(300)))
     command = ["import", str(tmp_path / "a.csv"), "-o", str(tmp_path / "a.h5")]
-    refused = CliRunner().invoke(app, command)
-    assert refused.exit_code == ExitCode.TROUBLE
+    refused = huddle(*command, code=3)
     assert "--columns 'time [s],X [m/s²],Y [m/s²]'" in refused.stderr
-    done = CliRunner().invoke(app, [*command, "--columns", "time,X,Y [m/s]", "--sample-unit", "g"])
-    assert done.exit_code == ExitCode.DONE
+    huddle(*command, "--columns", "time,X,Y [m/s]", "--sample-unit", "g")
     with Recording.open(tmp_path / "a.h5") as recording:
         (sensor,) = recording.sensors
         assert [(each.name, each.unit) for each in sensor.channels] == [("X", "g"), ("Y", "m/s")]
@@ -78,8 +74,7 @@ def test_of_one_sensor_at_two_rates_the_higher_is_imported(tmp_path: Path) -> No
         write_records(tmp_path / "a", samples, channel=channel, **options)  # type: ignore[arg-type]  # a dictionary of floats
     select = ["--channels", "?H?"]
     arguments = ["import", str(tmp_path / "a"), "-o", str(tmp_path / "a.h5"), *select]
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == ExitCode.DONE, found.output
+    found = huddle(*arguments)
     assert "left aside (20 Hz, where HH has 100 Hz): XX.ABC.00.BHZ" in found.stdout
     with Recording.open(tmp_path / "a.h5") as recording:
         (sensor,) = recording.sensors
@@ -92,8 +87,7 @@ def test_what_single_channels_lack_is_printed(tmp_path: Path) -> None:
     write_records(tmp_path / "b", counts(200, 2), channel="HHN", start=START + 100 * STEP)
     write_records(tmp_path / "c", counts(100, 3), channel="HHN", start=START + 500 * STEP)
     sources = [str(tmp_path / each) for each in "abc"]
-    found = CliRunner().invoke(app, ["import", *sources, "-o", str(tmp_path / "a.h5")])
-    assert found.exit_code == ExitCode.DONE
+    found = huddle("import", *sources, "-o", tmp_path / "a.h5")
     assert "missing where other channels have samples: HHN 3s in 2 pieces" in found.stdout
     with Recording.open(tmp_path / "a.h5") as recording:
         (sensor,) = recording.sensors
@@ -116,8 +110,7 @@ def waves(path: Path, unit: str = "m/s") -> list[str]:
 
 
 def invoked(*words: str) -> dict[str, Any]:
-    found = CliRunner().invoke(app, [*words, "--json", "-"])
-    assert found.exit_code == ExitCode.DONE, found.stderr
+    found = huddle(*words, "--json", "-")
     return dict(json.loads(found.stdout), stderr=found.stderr)
 
 
@@ -150,16 +143,14 @@ def test_octaves_keep_the_short_segment_of_the_highest_octave() -> None:
 @pytest.mark.parametrize("command", ["report", "calibrate", "plot", "repair", "watch"])
 def test_commands_of_recordings_name_the_import(tmp_path: Path, command: str) -> None:
     files = waves(tmp_path / "a b.csv")
-    found = CliRunner().invoke(app, [command, *files])
-    assert found.exit_code == ExitCode.TROUBLE
+    found = huddle(command, *files, code=3)
     assert f"huddle import '{files[0]}' --out 'a b.h5'" in found.stderr
 
 
 @pytest.mark.parametrize("command", ["check", "plan", "run", "record", "verify", "web", "tui"])
 def test_commands_of_benches_name_the_import(tmp_path: Path, command: str) -> None:
     files = waves(tmp_path / "a.csv")
-    found = CliRunner().invoke(app, [command, *files])
-    assert found.exit_code == ExitCode.USAGE
+    found = huddle(command, *files, code=2)
     assert f"not a bench file (.toml); convert it to a recording: huddle import {files[0]}" in (
         found.stderr
     )
@@ -168,5 +159,4 @@ def test_commands_of_benches_name_the_import(tmp_path: Path, command: str) -> No
 def test_a_recording_takes_no_response(tmp_path: Path) -> None:
     out = str(tmp_path / "a.h5")
     invoked("import", *waves(tmp_path / "a.csv"), "-o", out)
-    found = CliRunner().invoke(app, ["estimate", out, "--channels", "Z"])
-    assert found.exit_code == ExitCode.USAGE
+    huddle("estimate", out, "--channels", "Z", code=2)

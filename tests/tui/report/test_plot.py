@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from typer.testing import CliRunner
 
 import huddle
 from daq.bench.loading import parse
@@ -29,9 +28,9 @@ from daq.recording.reader import Recording
 from daq.results.result import Result
 from daq.results.signal import Signal
 from estimator.self_noise.result import Flag
+from tests import command
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tests.tui.night_recording import record
-from tui.commands.main import app
 from tui.page import drawing
 from tui.page.blocks import Plot
 from tui.report.figures.curves import MODEL_RANGE_DB, noise_plots, write_figure
@@ -194,16 +193,13 @@ def test_the_command_writes_what_the_suffix_says(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     recording = record(tmp_path / "night.h5")
-    runner = CliRunner()
     arguments = ["plot", str(recording), "--segment", "1s", "--models", "nlnm"]
-    result = runner.invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    command.huddle(*arguments)
     assert (tmp_path / "night.svg").read_text(encoding="utf-8").startswith("<?xml")
     request.getfixturevalue("empty_figures")
     out = tmp_path / "n.png"
     out.write_bytes(b"old")
-    result = runner.invoke(app, [*arguments, "-o", str(out), "--width", "90"])
-    assert result.exit_code == 0, result.output
+    command.huddle(*arguments, "-o", out, "--width", "90")
     assert out.read_bytes().startswith(b"\x89PNG")
     width = int.from_bytes(out.read_bytes()[16:20], "big")
     assert width == pytest.approx(90 / 25.4 * 300, abs=1)
@@ -223,8 +219,7 @@ def test_what_cannot_be_drawn_is_refused_before_the_estimate(
     options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["plot", "absent.h5", *options], terminal_width=300)
-    assert result.exit_code == 2
+    result = command.huddle("plot", "absent.h5", *options, terminal_width=300, code=2)
     assert re.search(said, result.stderr)
 
 
@@ -274,7 +269,7 @@ def test_a_recording_against_time(tmp_path: Path) -> None:
     files = []
     for name in ("a.svg", "b.svg"):
         arguments = ["plot", str(path), "--signal", "--segment", "10", "-o", str(tmp_path / name)]
-        assert CliRunner().invoke(app, arguments).exit_code == 0
+        command.huddle(*arguments)
         files.append((tmp_path / name).read_bytes())
     assert files[0] == files[1]
     with Recording.open(path) as recording, drawing.look():

@@ -9,18 +9,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import huddle
 from daq.archive.index import ROLLUP
 from daq.caveats import NO_CAVEATS, Caveat, Caveats
 from daq.recording.reader import Recording
 from daq.results.result import Result
+from tests import command
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_now, made_snapshot
 from tests.tui.report.written_report import Words
 from tui.application.state import VIEWS, State
 from tui.application.view import status_line
-from tui.commands.main import app
 from tui.report.figures.archive import days_figure
 from tui.report.figures.curves import noise_plots
 
@@ -39,15 +38,11 @@ def test_caveats_stay_what_they_are_in_files_and_words(caveats: Caveats) -> None
 @pytest.mark.usefixtures("empty_figures")
 def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> None:
     recording, out, page = tmp_path / "s.h5", tmp_path / "s.json", tmp_path / "s.html"
-    run = CliRunner()
-    simulate = ["simulate", "fig4", "--duration", "40s", "--out", str(recording)]
-    assert run.invoke(app, simulate).exit_code == 0
-    shown = run.invoke(app, ["estimate", str(recording), "--segment", "2s", "--json", str(out)])
-    assert shown.exit_code == 0, shown.output
+    command.huddle("simulate", "fig4", "--duration", "40s", "--out", recording)
+    shown = command.huddle("estimate", recording, "--segment", "2s", "--json", out)
     assert "simulated sensors" in shown.output
     assert json.loads(out.read_text(encoding="utf-8"))["recordings"][0]["simulated"] is True
-    written = run.invoke(app, ["report", str(recording), "--segment", "2s", "--out", str(page)])
-    assert written.exit_code == 0, written.output
+    command.huddle("report", recording, "--segment", "2s", "--out", page)
     text = Words(page.read_text(encoding="utf-8")).text
     assert "SIMULATED SENSORS" in text
 
@@ -55,17 +50,13 @@ def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> N
 def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Path) -> None:
     pytest.importorskip("obspy")
     recording, out = tmp_path / "s.h5", tmp_path / "s.mseed"
-    run = CliRunner()
-    run.invoke(app, ["simulate", "fig4", "--duration", "40s", "--out", str(recording)])
-    curves = run.invoke(app, ["export", str(recording), "--format", "npz", "--segment", "2s"])
-    assert curves.exit_code == 0, curves.output
+    command.huddle("simulate", "fig4", "--duration", "40s", "--out", recording)
+    command.huddle("export", recording, "--format", "npz", "--segment", "2s")
     with np.load(recording.with_suffix(".npz")) as file:
         assert str(file["simulated"]) == "true"
-    written = run.invoke(app, ["export", str(recording), "--format", "mseed", "--out", str(out)])
-    assert written.exit_code == 0, written.output
+    command.huddle("export", recording, "--format", "mseed", "--out", out)
     back = tmp_path / "back.h5"
-    taken = run.invoke(app, ["import", str(out), "--out", str(back)])
-    assert taken.exit_code == 0, taken.output
+    command.huddle("import", out, "--out", back)
     with Recording.open(back) as imported:
         assert imported.caveats
     assert "simulated sensors" in repr(huddle.open(back))
@@ -76,13 +67,10 @@ def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Pat
 
 def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
     recording, out = tmp_path / "s.h5", tmp_path / "a.json"
-    run = CliRunner()
-    simulate = ["simulate", "fig4", "--duration", "2min", "--out", str(recording)]
-    assert run.invoke(app, simulate).exit_code == 0
+    command.huddle("simulate", "fig4", "--duration", "2min", "--out", recording)
     options = ["--segment", "2s", "--json", str(out)]
     for _ in range(2):  # from the recording, and from the index alone
-        shown = run.invoke(app, ["archive", str(recording), *options])
-        assert shown.exit_code == 0, shown.output
+        shown = command.huddle("archive", recording, *options)
         assert "simulated sensors" in shown.output
         pooled = json.loads(out.read_text(encoding="utf-8"))["pooled"]
         assert "sensors-simulated" in [each["kind"] for each in pooled["facts"]]
@@ -92,8 +80,7 @@ def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
     (kept,) = (each for each in files if not each.name.startswith(ROLLUP))
     with h5py.File(kept, "r+") as file:
         del file.attrs["simulated"]
-    earlier = run.invoke(app, ["archive", "--store", str(store)])
-    assert earlier.exit_code == 0, earlier.output
+    earlier = command.huddle("archive", "--store", store)
     assert "simulated" not in earlier.output  # versions before did not keep it
 
 

@@ -108,9 +108,6 @@ def test_folders_of_public_tests(tmp_path: Path, usgs_recording: Path) -> None:
 
 
 def test_a_folder_is_asked_for(tmp_path: Path) -> None:
-    assert CliRunner().invoke(app, ["reproduce", "public"]).exit_code == ExitCode.USAGE
-    found = CliRunner().invoke(
-        app, ["reproduce", "public", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
-    )
-    assert found.exit_code == ExitCode.LIMIT_NOT_MET
+    huddle("reproduce", "public", code=2)
+    found = huddle("reproduce", "public", tmp_path / "none", "--out", tmp_path / "out", code=1)
     assert "expected a folder of waveforms" in " ".join(found.stderr.split())

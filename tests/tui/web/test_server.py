@@ -28,6 +28,7 @@ from typer.testing import CliRunner
 from daq.bench.tables.unattended import Web
 from daq.recording.reader import Recording
 from daq.results.result import Result
+from tests.command import huddle
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 from tests.tui.night_recording import HOSTILE
@@ -229,8 +230,7 @@ def test_nobody_steers_an_open_server(server: Server) -> None:
 
 
 def test_an_address_that_others_reach_needs_a_secret(folder: Path) -> None:
-    ended = CliRunner().invoke(app, ["web", str(bench_file(folder)), "--address", "0.0.0.0"])  # noqa: S104
-    assert ended.exit_code == 2
+    ended = huddle("web", bench_file(folder), "--address", "0.0.0.0", code=2)  # noqa: S104
     assert "address 0.0.0.0: other computers reach it; expected read =" in ended.stderr
 
 
