@@ -20,10 +20,8 @@ from typing import Any
 
 import pytest
 import tomlkit
-from typer.testing import CliRunner
 
 from tests.command import huddle
-from tui.commands.main import app
 
 ROOT = Path(__file__).parents[1]
 HOW_TOS = ROOT / "docs" / "examples"
@@ -75,19 +73,38 @@ def assert_prints(shown: list[str], printed: str) -> None:
             assert any(is_alike(line, each) for each in left), f"{line!r} is not in\n{printed}"
 
 
+def needs_usgs(command: str) -> bool:
+    """Return whether a command is of the recording of the US Geological Survey."""
+    return "tst" in command.lower()
+
+
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if any(sessions(page))], ids=lambda page: page.name
+    ("page", "usgs"),
+    [
+        pytest.param(page, usgs, id=page.name, marks=[pytest.mark.long] if usgs else [])
+        for page in PAGES
+        for usgs in (False, True)
+        if any(needs_usgs(command) == usgs for command, _ in sessions(page))
+    ],
 )
 def test_commands_print_what_is_shown(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+    page: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    *,
+    usgs: bool,
 ) -> None:
+    """The recording of the survey takes longer than all others: it is a long test."""
     monkeypatch.chdir(tmp_path)
+    if usgs:
+        for file in request.getfixturevalue("usgs_recording").iterdir():
+            (tmp_path / file.name).symlink_to(file)
     for command, shown in sessions(page):
+        if needs_usgs(command) != usgs:
+            continue
         words = shlex.split(command)
         assert words[0] == "huddle"
-        if any("TST" in word for word in words):
-            for file in request.getfixturevalue("usgs_recording").iterdir():
-                (tmp_path / file.name).symlink_to(file)
         words = [
             name
             for word in words[1:]
@@ -138,8 +155,7 @@ def test_shell_commands_of_how_tos_run_on_simulated_sensors(
         "huddle export night.h5 --format mseed --out bench.mseed",
         *(line for line in shown.splitlines() if " recordings/" not in line and "8h" not in line),
     ]:
-        done = CliRunner().invoke(app, shlex.split(line)[1:])
-        assert done.exit_code == 0, (line, done.output)
+        huddle(*shlex.split(line)[1:])
 
 
 def test_the_python_of_the_readme_prints_what_is_shown() -> None:
@@ -172,8 +188,7 @@ def test_the_gallery_draws_its_pictures(tmp_path: Path, monkeypatch: pytest.Monk
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     commands = re.findall(r"^huddle (?!tui )(.*)$", page, re.MULTILINE)
     for command in commands:
-        done = CliRunner().invoke(app, shlex.split(command))
-        assert done.exit_code == 0, (command, done.output)
+        huddle(*shlex.split(command))
     assert all(Path(each.rpartition(" ")[2]).stat().st_size > 9000 for each in commands[1:])
 
 
