@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daq.caveats import Caveats
 from daq.estimation.recording_set import continuations
 from daq.protocols.block import READING_INTERVAL_NS, EventKind, Quantity, Reading
 from daq.recording.reader import Recording
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from daq.bench.channel import Channel
     from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
     from daq.recording.reader import SensorRecord
@@ -62,22 +60,8 @@ def with_uncounted(
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedSensor:
-    """One sensor as a recording has it."""
-
-    name: str
-    model: str
-    serial_number: str
-    driver: str
-    sampling_rate: float
-    channels: tuple[Channel, ...]
-    temperature: float | None = None
-    """In °C, as the device reported at the start."""
-
-
-@dataclass(frozen=True, slots=True)
 class Source:
-    """One recording.
+    """One recording, and what is not in its description.
 
     Attributes
     ----------
@@ -85,7 +69,6 @@ class Source:
     sha256 : str
         Of the whole file as it is now; empty while it is being written.
     n_bytes : int
-    run_id, software, operator, location : str
     started : datetime
         UTC.
     last : datetime
@@ -95,8 +78,6 @@ class Source:
         recorder that was killed, and not repaired since.
     recording : Recording
         Its description; its file is closed.
-    sensors : tuple of RecordedSensor
-    caveats : Caveats
     logged_events : tuple of LoggedEvent
         In time order.
     readings : tuple of Reading
@@ -110,16 +91,10 @@ class Source:
     path: Path
     sha256: str
     n_bytes: int
-    run_id: str
-    software: str
-    operator: str
-    location: str
     started: datetime
     last: datetime
     state: State
     recording: Recording
-    sensors: tuple[RecordedSensor, ...]
-    caveats: Caveats
     logged_events: tuple[LoggedEvent, ...]
     readings: tuple[Reading, ...] = ()
     signed_by: str = ""
@@ -170,27 +145,10 @@ def _source(recording: Recording, *, continued: bool) -> Source:
         path=path,
         sha256="" if state == "growing" else _sha256(path),
         n_bytes=path.stat().st_size,
-        run_id=recording.run_id,
-        software=recording.software,
-        operator=recording.operator,
-        location=recording.location,
         started=recording.created.astimezone(UTC),
         last=datetime.fromtimestamp(last / _SECOND_NS, tz=UTC),
         state=state,
         recording=recording,
-        sensors=tuple(
-            RecordedSensor(
-                sensor.name,
-                sensor.model,
-                sensor.serial_number,
-                sensor.driver,
-                sensor.sampling_rate,
-                sensor.channels,
-                sensor.temperature,
-            )
-            for sensor in recording.sensors
-        ),
-        caveats=recording.caveats,
         logged_events=tuple(logged_events),
         readings=recording.readings or _stated_at_start(recording),
         signed_by=signed_by(path) if state == "closed" else "",
@@ -267,7 +225,7 @@ def conditions(
         for sensor in (() if about is None else about.sensors)
         if sensor.data_sheet is not None
     }
-    names = [*(sensor.name for sensor in found[0].sensors), ""]
+    names = [*(sensor.name for sensor in found[0].recording.sensors), ""]
     return tuple(
         Condition(
             sensor,

@@ -99,13 +99,13 @@ def _administrative(
         phone=laboratory.phone,
     )
     responsible = issue.by if issue else table.responsible
-    _persons(_add(part, "respPersons"), responsible, found[0].operator)
+    _persons(_add(part, "respPersons"), responsible, found[0].recording.operator)
     _contact(_add(part, "customer"), (customer.name, customer.address), email=customer.email)
     statements = _add(part, "statements")
     lines = [certificate.SCOPE, f"Traceability: {table.traceability or 'not given'}"]
     if laboratory.accreditation:
         lines.append(laboratory.accreditation)
-    caveats = Caveats.joined(source.caveats for source in found)
+    caveats = Caveats.joined(source.recording.caveats for source in found)
     lines[:0] = [each.words.scope for each in caveats]
     if issue is None or issue.is_specimen:
         what = "DRAFT" if issue is None else certificate.SPECIMEN
@@ -130,7 +130,7 @@ def _core(
     _add(core, "countryCodeISO3166_1", country)
     _add(core, "usedLangCodeISO639_1", _LANGUAGE)
     _add(core, "mandatoryLangCodeISO639_1", _LANGUAGE)
-    _add(core, "uniqueIdentifier", issue.name if issue else f"DRAFT {first.run_id}")
+    _add(core, "uniqueIdentifier", issue.name if issue else f"DRAFT {first.recording.run_id}")
     identifications = [("other", "SHA-256 of the recording", s.sha256 or "none") for s in found]
     if order:
         identifications.append(("customer", "order", order))
@@ -142,7 +142,11 @@ def _core(
         _add(core, "receiptDate", table.received.isoformat())
     _add(core, "beginPerformanceDate", f"{first.started:%Y-%m-%d}")
     _add(core, "endPerformanceDate", f"{last.last:%Y-%m-%d}")
-    _add(core, "performanceLocation", "other" if table.place or first.location else "laboratory")
+    _add(
+        core,
+        "performanceLocation",
+        "other" if table.place or first.recording.location else "laboratory",
+    )
     if issue is not None and issue.replaces is not None:
         before = _add(core, "previousReport")
         _text(before, "referral", issue.reason)
@@ -155,7 +159,7 @@ def _items(items: ET.Element, last: Source, about: Bench | None) -> None:
     """Add the sensors."""
     condition = "" if about is None else about.certificate.condition
     makers = certificate.manufacturers(about)
-    for sensor in last.sensors:
+    for sensor in last.recording.sensors:
         item = _add(items, "item")
         _text(item, "name", sensor.name)
         if condition:

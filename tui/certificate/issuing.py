@@ -158,7 +158,7 @@ def examine(
     for source in found:
         objections += [
             Objection(f"{source.path}: {each.words.refusal}", "; --specimen makes a specimen")
-            for each in source.caveats
+            for each in source.recording.caveats
         ]
         if source.state in {"growing", "left-open"}:
             wanted = "wait for its end" if source.state == "growing" else "huddle repair closes it"
@@ -184,7 +184,7 @@ def examine(
     stated = {} if outline is None else outline.sensitivities
     unknown = [
         f"{sensor.name}.{channel.name}"
-        for sensor in found[0].sensors
+        for sensor in found[0].recording.sensors
         for channel in sensor.channels
         if not channel.auxiliary
         and ((own := stated.get((sensor.name, channel.name))) is None or not own.is_stated)
@@ -249,7 +249,7 @@ def issue(result: Result, examined: Examined, ledger: Ledger) -> tuple[LedgerEnt
     if [source.sha256 for source in now] != [source.sha256 for source in found]:
         raise NotIssuedError("a recording was changed while it was estimated; try again")
     prefix = "HT" if about is None else about.certificate.prefix
-    runs = [(source.path.name, source.run_id, source.sha256) for source in found]
+    runs = [(source.path.name, source.recording.run_id, source.sha256) for source in found]
     roots = dict(identity(source.path) for source in found)
     table = settings_table(result)
     if about is not None and about.certificate.guard_band != 1.0:

@@ -99,7 +99,7 @@ def document(
     whole = {
         "schema_version": SCHEMA_VERSION,
         "software": {"name": "huddle-bench", "version": __version__},
-        "run_id": sources[-1].run_id if sources else None,
+        "run_id": sources[-1].recording.run_id if sources else None,
         "recordings": [_recording(source) for source in sources],
         "settings": _settings(result),
     }
@@ -120,7 +120,7 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
     snapshot = result.snapshot
     start_ns = snapshot.start_utc_ns
     recordings = [
-        {"file": each.path.name, "run_id": each.run_id, "sha256": each.sha256 or None}
+        {"file": each.path.name, "run_id": each.recording.run_id, "sha256": each.sha256 or None}
         for each in (result.sources if with_recordings else ())
     ]
     return {
@@ -149,15 +149,15 @@ def _recording(source: Source) -> RecordingDocument:
     bench = source.recording.outline
     return {
         "file": source.path.name,
-        "run_id": source.run_id,
+        "run_id": source.recording.run_id,
         "sha256": source.sha256 or None,
         "signed_by": source.signed_by or None,
         "bytes": source.n_bytes,
         "state": source.state,
-        "software": source.software,
-        "operator": source.operator or None,
-        "location": source.location or None,
-        **cast("CaveatsDocument", source.caveats.keys),
+        "software": source.recording.software,
+        "operator": source.recording.operator or None,
+        "location": source.recording.location or None,
+        **cast("CaveatsDocument", source.recording.caveats.keys),
         "bench": None if bench is None else bench.name,
         "conditions": [
             {
@@ -191,7 +191,7 @@ def _recording(source: Source) -> RecordingDocument:
                     for channel in sensor.channels
                 ],
             }
-            for sensor in source.sensors
+            for sensor in source.recording.sensors
         ],
     }
 

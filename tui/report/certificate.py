@@ -136,7 +136,7 @@ CHECKLIST = (
     ),
     Requirement(
         "7.8.2.1 c", "place of the test", "[certificate] place, or location",
-        lambda bench, source: bool(bench.certificate.place or source.location),
+        lambda bench, source: bool(bench.certificate.place or source.recording.location),
     ),
     Requirement(
         "7.8.2.1 e", "name and contact of the customer", "[customer] name, and address or email",
@@ -166,7 +166,7 @@ CHECKLIST = (
         lambda bench, _: bool(bench.certificate.responsible),
     ),
     Requirement(
-        "7.8.3.1 / 7.5.1", "operator", "operator", lambda _, source: bool(source.operator)
+        "7.8.3.1 / 7.5.1", "operator", "operator", lambda _, source: bool(source.recording.operator)
     ),
     Requirement(
         "7.8.4.1 c", "metrological traceability", "[certificate] traceability",
@@ -191,7 +191,7 @@ def unidentified(bench: Bench, source: Source) -> list[str]:
     makers = manufacturers(bench)
     return [
         sensor.name
-        for sensor in source.sensors
+        for sensor in source.recording.sensors
         if not (sensor.model and sensor.serial_number and makers.get(sensor.name))
     ]
 
@@ -255,7 +255,7 @@ def notices(
 ) -> tuple[Paragraph, ...]:
     """Return what must be read before the numbers."""
     settings = result.settings
-    caveats = Caveats.joined(source.caveats for source in found)
+    caveats = Caveats.joined(source.recording.caveats for source in found)
     lines = [Paragraph(each.words.warning, "bad") for each in caveats]
     if issue is None:
         text = "DRAFT: not a certificate. huddle issue makes one."
@@ -315,7 +315,7 @@ def watermark(found: Sequence[Source], issue: Issue | None) -> str:
     """Return what stands across every page."""
     if issue is not None and issue.is_specimen:
         return SPECIMEN
-    caveats = Caveats.joined(source.caveats for source in found)
+    caveats = Caveats.joined(source.recording.caveats for source in found)
     return caveats.after().upper() or ("DRAFT" if issue is None else "")
 
 
@@ -325,7 +325,7 @@ def parties(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -
     customer = Customer() if bench is None else bench.customer
     table = CertificateTable() if bench is None else bench.certificate
     first, last = found[0], found[-1]
-    place = table.place or first.location or laboratory.address
+    place = table.place or first.recording.location or laboratory.address
     rows = [
         ("Bench", first.bench.name if first.bench else _NONE),
         ("Laboratory", _joined(laboratory.name, laboratory.address)),
@@ -336,13 +336,13 @@ def parties(found: Sequence[Source], bench: Bench | None, issue: Issue | None) -
         ("Place of the test", place or _NONE),
         ("Received", _NONE if table.received is None else table.received.isoformat()),
         ("Condition", table.condition or _NONE),
-        ("Location", first.location if first.location != place else ""),
+        ("Location", first.recording.location if first.recording.location != place else ""),
         ("Tested", f"{utc_time(first.started)} to {utc_time(last.last)}"),
         ("Procedure", table.procedure or _NONE),
         ("Method", PROCEDURE),
         ("Deviations", table.deviations or "none"),
         ("Traceability", table.traceability or _traceability(bench)),
-        ("Operator", first.operator or _NONE),
+        ("Operator", first.recording.operator or _NONE),
         ("Authorised by", (issue.by if issue else table.responsible) or _NONE),
         ("Date of issue", f"{issue.at:%Y-%m-%d}" if issue and issue.entry else "not issued"),
         ("Report made by", f"huddle {version('huddle-bench')}"),
@@ -387,7 +387,9 @@ def conditions_stated(
         for each in stated
     ]
     titles = ("of", "quantity", "unit", "lowest", "highest", "readings", "range of the data sheet")
-    silent = {sensor.name for sensor in found[0].sensors} - {each.sensor for each in stated}
+    silent = {sensor.name for sensor in found[0].recording.sensors} - {
+        each.sensor for each in stated
+    }
     note = "Conditions are read from the devices once a minute."
     if silent:
         note += f" Nothing is stated by {', '.join(sorted(silent))}."

@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from daq.bench.model import Bench
     from daq.clocks.clock_model import ClockState
     from daq.estimation.snapshot import Snapshot
+    from daq.recording.sensor_record import SensorRecord
     from daq.results.result import Result
-    from daq.results.sources import RecordedSensor, Source
+    from daq.results.sources import Source
 
 
 def calibration_section(result: Result) -> Section | None:
@@ -213,8 +214,8 @@ def _recordings(found: Sequence[Source]) -> list[Part]:
                     ("Local time", local_time(source.started, source.bench)),
                     *([("Last sample", utc_time(source.last))] if len(found) > 1 else []),
                     ("Duration", format_duration(round(length))),
-                    ("Recorded by", source.software),
-                    ("Run", source.run_id),
+                    ("Recorded by", source.recording.software),
+                    ("Run", source.recording.run_id),
                     ("Signed with key", source.signed_by or "not signed"),
                     ("SHA-256", source.sha256 or "none: the file is still being written"),
                 )
@@ -227,7 +228,7 @@ def _sensors(
     snapshot: Snapshot, found: Sequence[Source], about: Bench | None
 ) -> tuple[Table, Table]:
     makers = certificate.manufacturers(about)
-    sensors = found[-1].sensors
+    sensors = found[-1].recording.sensors
     clocks = {clock.sensor: clock for clock in snapshot.clocks}
     rows = tuple(
         (
@@ -253,7 +254,7 @@ def _sensors(
     return Table(header, rows, left=frozenset({0, 1, 2, 3, 4})), channels
 
 
-def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:
+def _actual_rate(sensor: SensorRecord, clock: ClockState | None) -> str:
     if clock is None:
         return "?"
     rate = sensor.sampling_rate * (1 + clock.ppm * 1e-6)
@@ -262,7 +263,7 @@ def _actual_rate(sensor: RecordedSensor, clock: ClockState | None) -> str:
     return f"{rate:.6f} ±{max(error, 1e-6):.6f}" if clock.ppm_std > 0 else f"{rate:.6f}"
 
 
-def _channel_rows(sensor: RecordedSensor) -> list[tuple[str, ...]]:
+def _channel_rows(sensor: SensorRecord) -> list[tuple[str, ...]]:
     """Return a row for each kind of channel of a sensor: those alike go together."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for channel in sensor.channels:

@@ -183,7 +183,7 @@ class Tests:
         return [
             (entry, ledger.folder / entry.file)
             for entry in ledger.entries()
-            if source.run_id in entry.runs and entry.file
+            if source.recording.run_id in entry.runs and entry.file
         ]
 
 

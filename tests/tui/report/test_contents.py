@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -160,7 +161,9 @@ def test_all_cells_of_two_methods_and_free_clocks_are_as_kept(share: float) -> N
 def test_one_simulated_recording_makes_the_report_one_of_a_model(reported: Reported) -> None:
     (real,) = sources([reported.recording])
     assert watermark([real], None) == "DRAFT"
-    both = [real, replace(real, caveats=Caveats([Caveat.SIMULATED]))]
+    model = copy(real.recording)
+    model.caveats = Caveats([Caveat.SIMULATED])
+    both = [real, replace(real, recording=model)]
     assert watermark(both, None) == "SIMULATED"
     first, *_ = notices(both, reported.result, None, None)
     assert first.text.startswith("SIMULATED SENSORS")

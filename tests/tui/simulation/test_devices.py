@@ -97,5 +97,5 @@ def test_a_recording_of_simulated_ports_is_simulated_whatever_its_bench_file(
         assert not recording.bench.runs_simulated
         temperatures = [sensor.temperature for sensor in recording.sensors]
     (source,) = sources([out])  # what huddle check shows is kept, for the certificate
-    assert [sensor.temperature for sensor in source.sensors] == temperatures
+    assert [sensor.temperature for sensor in source.recording.sensors] == temperatures
     assert all(each is not None and 10 < each < 60 for each in temperatures)
