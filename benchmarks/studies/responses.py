@@ -16,7 +16,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from estimator.levels.bands import bin_correlation
-from estimator.responses.calibration import calibrate_sensor
+from estimator.responses.calibration import CommonMotion
 from estimator.responses.derived_quantities import derived
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
@@ -82,16 +82,10 @@ def _scores(rng: np.random.Generator, snr: float) -> dict[str, FloatArray]:
     samples = np.hstack([motion, late @ truth.T, third]) + rng.standard_normal((n, 9))
     spectra = CrossSpectra(WelchSettings(rate, segment), 9)
     spectra.add(samples, np.arange(0, n - segment + 1, segment // 2))
-    found = calibrate_sensor(
-        spectra.csm(),
-        spectra.settings.frequencies,
-        dims=_DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=spectra.n_effective,
-        band=(1.0, 20.0),
-        correlation=bin_correlation(get_window("hann", 512), 256),
-    )
+    correlation = bin_correlation(get_window("hann", 512), 256)
+    frequency, n_effective = spectra.settings.frequencies, spectra.n_effective
+    motion = CommonMotion(spectra.csm(), frequency, _DIMS, 0, n_effective, correlation)
+    found = motion.calibrated(1, (1.0, 20.0))
     true = {"delay": np.full(3, delay), "skew": np.zeros(2)} | derived(truth)
     scores = {}
     for name in QUANTITIES:

@@ -15,7 +15,7 @@ from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import InsufficientDataError
-from estimator.responses.calibration import calibrate_sensor, response_curve
+from estimator.responses.calibration import CommonMotion
 from estimator.responses.derived_quantities import Value
 from estimator.responses.edge_leakage import channel_responses, slope_factor
 from estimator.self_noise.coherency import coherency, other_channels, own_channels
@@ -128,19 +128,19 @@ def calibrate(
         if sensor == chosen:
             continue
         try:
-            found = work.sensor(sensor, work.band)
+            found = work.motion.calibrated(sensor, work.band)
             if relative_time(snapshot, names[sensor], names[chosen]) is RelativeTime.ALIGNED:
                 unknown = np.full(found.delay.value.shape, np.nan)
                 found = replace(found, delay=Value(unknown, unknown))
             sensors.append(found)
-            curves.append(work.curve(sensor))
+            curves.append(work.motion.curve(sensor, work.edges(3)))
         except InsufficientDataError as error:
             refused[sensor] = str(error)
             continue
         budgets += work.sensitivities(sensors[-1])
         for low, high in work.octaves():
             try:
-                budgets += work.sensitivities(work.sensor(sensor, (low, high)))
+                budgets += work.sensitivities(work.motion.calibrated(sensor, (low, high)))
             except InsufficientDataError:  # not coherent there
                 continue
     if not sensors:
@@ -178,7 +178,6 @@ class _Work:
         name = snapshot.sensor_names[reference]
         self._certificates = certificates
         self.band = estimate.band
-        self._correlation = correlation_of(estimate.settings)
         self._first = np.cumsum([0, *snapshot.dims])
         scale = np.ones(len(snapshot.channels))
         own = [label for label in snapshot.channels if label.sensor == name]
@@ -204,46 +203,26 @@ class _Work:
         self._of_reference = math.hypot(self._of_reference, of_certificates)
         self._scale = scale
         self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
-        self._coherence = CanonicalCoherence(coherency(self._csm, snapshot.dims).matrix)
-        n = snapshot.n_effective
-        self._averages = min([n, *(octave.n_effective for octave in snapshot.octaves)])
+        self.motion = CommonMotion(
+            self._csm,
+            snapshot.frequency,
+            snapshot.dims,
+            reference,
+            min([snapshot.n_effective, *(octave.n_effective for octave in snapshot.octaves)]),
+            correlation_of(estimate.settings),
+            CanonicalCoherence(coherency(self._csm, snapshot.dims).matrix),
+        )
         self._bending = self._curvature()
 
-    def sensor(self, sensor: int, band: tuple[float, float]) -> SensorCalibration:
-        return calibrate_sensor(
-            self._csm,
-            self.snapshot.frequency,
-            dims=self.snapshot.dims,
-            sensor=sensor,
-            reference=self._reference,
-            n_effective=self._averages,
-            band=band,
-            correlation=self._correlation,
-            coherence=self._coherence,
-        )
-
-    def curve(self, sensor: int) -> ResponseCurve:
-        return response_curve(
-            self._csm,
-            self.snapshot.frequency,
-            self._edges(3),
-            dims=self.snapshot.dims,
-            sensor=sensor,
-            reference=self._reference,
-            n_effective=self._averages,
-            correlation=self._correlation,
-            coherence=self._coherence,
-        )
-
     def octaves(self) -> list[tuple[float, float]]:
-        edges = self._edges(BANDS_PER_OCTAVE)
+        edges = self.edges(BANDS_PER_OCTAVE)
         return (
             list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
             if len(edges) > 2
             else []
         )
 
-    def _edges(self, per_octave: int) -> FloatArray:
+    def edges(self, per_octave: int) -> FloatArray:
         low, high = self.band
         count = max(1, round(per_octave * math.log2(high / low)))
         return np.asarray(np.geomspace(low, high * (1 + 1e-9), count + 1))
@@ -375,7 +354,7 @@ class _Work:
         share = share[np.isfinite(share)]
         if not share.size:
             return 0.0
-        return float(np.sqrt(share.mean() / (2 * max(self._averages, 1.0) * share.size)))
+        return float(np.sqrt(share.mean() / (2 * max(self.motion.n_effective, 1.0) * share.size)))
 
     def noise(
         self, sensors: Sequence[SensorCalibration], sensitivities: Sequence[Budget]

@@ -125,64 +125,168 @@ class _Pair:
     is_ambiguous: bool
 
 
-def _pair(
-    csm: ComplexArray,
-    frequency: FloatArray,
-    *,
-    dims: tuple[int, ...],
-    sensor: int,
-    reference: int,
-    n_effective: float,
-    band: tuple[float, float],
-    coherence: CanonicalCoherence | None,
-) -> _Pair:
-    start = relative_response(
-        csm,
-        frequency,
-        dims=dims,
-        first=reference,
-        second=sensor,
-        band=band,
-        coherence=coherence,
-    )
-    inside = (frequency >= start.low) & (frequency <= start.high) & (frequency > 0)
-    inside &= np.isfinite(csm).all(axis=(1, 2))
-    own = [np.array(own_channels(dims, each)) for each in (sensor, reference)]
-    part, f = csm[inside], frequency[inside]
-    rest = _instruments(part, dims, (sensor, reference), n_effective)
-    S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
-    S_kk = part[:, rest[:, None], rest]
-    by = np.linalg.solve(S_kk, S_rk.conj().swapaxes(1, 2))  # S_kk^-1 S_kr
-    power, cross = S_rk @ by, S_jk @ by
-    # less what the others tell by chance: Nagar's correction of two-stage least squares
-    chance = len(rest) / (n_effective - len(rest))
-    power -= chance * (part[:, own[1][:, None], own[1]] - power)
-    cross -= chance * (part[:, own[0][:, None], own[1]] - cross)
-    power = (power + power.conj().swapaxes(1, 2)) / 2
-    response = np.linalg.solve(power.swapaxes(1, 2), cross.swapaxes(1, 2)).swapaxes(1, 2)
-    d = len(own[0])
-    rows = np.zeros((len(f), d, csm.shape[1]), dtype=np.complex128)
-    rows[:, np.arange(d), own[0]] = 1.0
-    rows[:, :, own[1]] = -response
-    # residuals of n averages from d fitted elements
-    sigma = rows @ part @ rows.conj().swapaxes(1, 2)
-    sigma *= n_effective / (n_effective - d)
-    level = _level(np.einsum("fcc->f", sigma).real / d)
-    usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
-    if usable.sum() < 4:
-        raise InsufficientDataError(
-            f"sensors {reference} and {sensor}: {usable.sum()} comparable frequencies from "
-            f"{band[0]:g} to {band[1]:g} Hz; expected 4 or more"
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonMotion:
+    """Motion that sensors share, by which they are calibrated against one of them.
+
+    Attributes
+    ----------
+    csm : complex128, shape (n_freqs, n_channels, n_channels)
+        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
+        channels grouped by sensor; three sensors or more.
+    frequency : float64, shape (n_freqs,)
+        Hz, ascending.
+    dims : tuple of int
+    reference : int
+        Index from 0.
+    n_effective : float
+        Number of independent averages.
+    correlation : float64, shape (n_lags,)
+        Correlation of neighbouring frequencies, from
+        `estimator.levels.bands.bin_correlation`.
+    coherence : CanonicalCoherence, optional
+        Of the same matrix, to avoid its computation for several sensors and bands.
+    """
+
+    csm: ComplexArray
+    frequency: FloatArray
+    dims: tuple[int, ...]
+    reference: int
+    n_effective: float
+    correlation: FloatArray
+    coherence: CanonicalCoherence | None = None
+
+    def calibrated(self, sensor: int, band: tuple[float, float]) -> SensorCalibration:
+        """Calibrate a sensor, with as many channels as the reference, over a band in Hz.
+
+        Raises
+        ------
+        InsufficientDataError
+            As `estimator.checks.relative_response.relative_response`.
+        """
+        pair = self._pair(sensor, band)
+        f, d = pair.frequency, pair.response.shape[1]
+        inflation = 1 + 2 * float(np.sum(self.correlation[1 : len(f)]))
+        omega = 2 * np.pi * f
+        delay = np.full(d, pair.delay)
+        matrix = np.zeros((d, d))
+        information = pair.weight.sum(axis=0).real
+        for _ in range(_STEPS):
+            aligned = pair.response * np.exp(1j * omega[:, None] * delay)[:, :, None]
+            total = np.einsum("fca,fab->cb", aligned, pair.weight).real
+            matrix = np.linalg.solve(information.T, total.T).T
+            met = np.einsum("fca,fab,cb->fc", aligned, pair.weight, matrix).imag
+            energy = np.einsum("ca,fab,cb->fc", matrix, pair.weight, matrix).real
+            delay = delay - (omega @ met) / (omega**2 @ energy)
+        residual = aligned - matrix
+        own = np.einsum("fcc->fc", pair.noise).real
+        square = np.einsum("fca,fab,fcb->fc", residual, pair.weight, residual.conj()).real / own
+        excess = float(np.sqrt(max(np.mean(square) / d, 0.0)))
+        inverse = np.linalg.inv(information)
+        middle = np.einsum("fcg,fab->cagb", pair.noise, pair.weight)
+        covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
+        covariance = covariance.reshape(d * d, d * d) * inflation / 2
+        delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
+        unknown = np.nan if pair.is_ambiguous else 0.0
+        to_first = np.eye(d)
+        to_first[:, 0] -= 1.0
+        return SensorCalibration(
+            sensor=sensor,
+            reference=self.reference,
+            low=float(f[0]),
+            high=float(f[-1]),
+            matrix=Value(matrix, np.sqrt(np.diag(covariance)).reshape(d, d)),
+            **with_errors(matrix, covariance),
+            delay=Value(unknown + delay, unknown + np.sqrt(np.diag(delay_cov))),
+            skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
+            is_ambiguous=pair.is_ambiguous,
+            excess=excess,
+            dof=2 * max(self.n_effective - d, 1.0) * len(f) / inflation,
+            n_frequencies=len(f),
         )
-    scale = level[usable, None, None]
-    return _Pair(
-        f[usable],
-        np.asarray(response[usable], dtype=np.complex128),
-        np.asarray(n_effective * power[usable] / scale, dtype=np.complex128),
-        np.asarray(sigma[usable] / scale, dtype=np.complex128),
-        start.delay,
-        start.is_ambiguous,
-    )
+
+    def curve(self, sensor: int, edges: FloatArray) -> ResponseCurve:
+        """Return the relative response of a sensor in narrow bands.
+
+        Parameters
+        ----------
+        sensor : int
+        edges : float64, shape (n_bands + 1,)
+            Hz, ascending.
+        """
+        pair = self._pair(sensor, (float(edges[0]), float(edges[-1])))
+        d, n_bands = pair.response.shape[1], len(edges) - 1
+        matrix = np.full((n_bands, d, d), np.nan, dtype=np.complex128)
+        error = np.full((n_bands, d, d), np.nan)
+        number = np.searchsorted(edges, pair.frequency, side="right") - 1
+        centre = np.sqrt(edges[1:] * edges[:-1])
+        for band in range(n_bands):
+            inside: BoolArray = number == band
+            if not inside.any():
+                continue
+            weight = pair.weight[inside]
+            information = weight.sum(axis=0)
+            total = np.einsum("fca,fab->cb", pair.response[inside], weight)
+            matrix[band] = np.linalg.solve(information.T, total.T).T
+            inverse = np.linalg.inv(information)
+            own = np.einsum("fcc->fc", pair.noise[inside]).real
+            middle = np.einsum("fc,fab->cab", own, weight)
+            variance = np.einsum("ia,cab,bi->ci", inverse, middle, inverse).real
+            n_lags = int(inside.sum())
+            inflation = 1 + 2 * float(np.sum(self.correlation[1:n_lags]))
+            error[band] = np.sqrt(np.maximum(variance, 0.0) * inflation / 2)
+            centre[band] = float(pair.frequency[inside].mean())
+        return ResponseCurve(sensor, self.reference, centre, matrix, error)
+
+    def _pair(self, sensor: int, band: tuple[float, float]) -> _Pair:
+        start = relative_response(
+            self.csm,
+            self.frequency,
+            dims=self.dims,
+            first=self.reference,
+            second=sensor,
+            band=band,
+            coherence=self.coherence,
+        )
+        n, f = self.n_effective, self.frequency
+        inside = (f >= start.low) & (f <= start.high) & (f > 0)
+        inside &= np.isfinite(self.csm).all(axis=(1, 2))
+        own = [np.array(own_channels(self.dims, each)) for each in (sensor, self.reference)]
+        part, f = self.csm[inside], f[inside]
+        rest = _instruments(part, self.dims, (sensor, self.reference), n)
+        S_jk, S_rk = (part[:, each[:, None], rest] for each in own)
+        S_kk = part[:, rest[:, None], rest]
+        by = np.linalg.solve(S_kk, S_rk.conj().swapaxes(1, 2))  # S_kk^-1 S_kr
+        power, cross = S_rk @ by, S_jk @ by
+        # less what the others tell by chance: Nagar's correction of two-stage least squares
+        chance = len(rest) / (n - len(rest))
+        power -= chance * (part[:, own[1][:, None], own[1]] - power)
+        cross -= chance * (part[:, own[0][:, None], own[1]] - cross)
+        power = (power + power.conj().swapaxes(1, 2)) / 2
+        response = np.linalg.solve(power.swapaxes(1, 2), cross.swapaxes(1, 2)).swapaxes(1, 2)
+        d = len(own[0])
+        rows = np.zeros((len(f), d, part.shape[1]), dtype=np.complex128)
+        rows[:, np.arange(d), own[0]] = 1.0
+        rows[:, :, own[1]] = -response
+        # residuals of n averages from d fitted elements
+        sigma = rows @ part @ rows.conj().swapaxes(1, 2)
+        sigma *= n / (n - d)
+        level = _level(np.einsum("fcc->f", sigma).real / d)
+        usable = (level > 0) & (np.linalg.eigvalsh(power)[:, 0] > 0)
+        if usable.sum() < 4:
+            raise InsufficientDataError(
+                f"sensors {self.reference} and {sensor}: {usable.sum()} comparable frequencies "
+                f"from {band[0]:g} to {band[1]:g} Hz; expected 4 or more"
+            )
+        scale = level[usable, None, None]
+        return _Pair(
+            f[usable],
+            np.asarray(response[usable], dtype=np.complex128),
+            np.asarray(n * power[usable] / scale, dtype=np.complex128),
+            np.asarray(sigma[usable] / scale, dtype=np.complex128),
+            start.delay,
+            start.is_ambiguous,
+        )
 
 
 def _instruments(
@@ -231,154 +335,9 @@ def _level(noise: FloatArray) -> FloatArray:
     return np.where(known & (noise < _STANDS_OUT * around), around, noise)
 
 
-def calibrate_sensor(
-    csm: ComplexArray,
-    frequency: FloatArray,
-    *,
-    dims: tuple[int, ...],
-    sensor: int,
-    reference: int,
-    n_effective: float,
-    band: tuple[float, float],
-    correlation: FloatArray,
-    coherence: CanonicalCoherence | None = None,
-) -> SensorCalibration:
-    """Calibrate one sensor against another over a band.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-        One-sided cross-spectral matrix in unit**2/Hz, ``csm[f, p, q] = E[X_p conj(X_q)]``,
-        channels grouped by sensor; three sensors or more.
-    frequency : float64, shape (n_freqs,)
-        Hz, ascending.
-    dims : tuple of int
-    sensor, reference : int
-        Indices from 0, of sensors with equal numbers of channels.
-    n_effective : float
-        Number of independent averages.
-    band : (float, float)
-        Hz.
-    correlation : float64, shape (n_lags,)
-        Correlation of neighbouring frequencies, from
-        `estimator.levels.bands.bin_correlation`.
-    coherence : CanonicalCoherence, optional
-        Of the same matrix, to avoid its computation for several sensors and bands.
-
-    Raises
-    ------
-    InsufficientDataError
-        As `estimator.checks.relative_response.relative_response`.
-    """
-    pair = _pair(
-        csm,
-        frequency,
-        dims=dims,
-        sensor=sensor,
-        reference=reference,
-        n_effective=n_effective,
-        band=band,
-        coherence=coherence,
-    )
-    f, d = pair.frequency, pair.response.shape[1]
-    inflation = 1 + 2 * float(np.sum(correlation[1 : len(f)]))
-    omega = 2 * np.pi * f
-    delay = np.full(d, pair.delay)
-    matrix = np.zeros((d, d))
-    information = pair.weight.sum(axis=0).real
-    for _ in range(_STEPS):
-        aligned = pair.response * np.exp(1j * omega[:, None] * delay)[:, :, None]
-        total = np.einsum("fca,fab->cb", aligned, pair.weight).real
-        matrix = np.linalg.solve(information.T, total.T).T
-        met = np.einsum("fca,fab,cb->fc", aligned, pair.weight, matrix).imag
-        energy = np.einsum("ca,fab,cb->fc", matrix, pair.weight, matrix).real
-        delay = delay - (omega @ met) / (omega**2 @ energy)
-    residual = aligned - matrix
-    own = np.einsum("fcc->fc", pair.noise).real
-    square = np.einsum("fca,fab,fcb->fc", residual, pair.weight, residual.conj()).real / own
-    excess = float(np.sqrt(max(np.mean(square) / d, 0.0)))
-    inverse = np.linalg.inv(information)
-    middle = np.einsum("fcg,fab->cagb", pair.noise, pair.weight)
-    covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
-    covariance = covariance.reshape(d * d, d * d) * inflation / 2
-    delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
-    unknown = np.nan if pair.is_ambiguous else 0.0
-    to_first = np.eye(d)
-    to_first[:, 0] -= 1.0
-    return SensorCalibration(
-        sensor=sensor,
-        reference=reference,
-        low=float(f[0]),
-        high=float(f[-1]),
-        matrix=Value(matrix, np.sqrt(np.diag(covariance)).reshape(d, d)),
-        **with_errors(matrix, covariance),
-        delay=Value(unknown + delay, unknown + np.sqrt(np.diag(delay_cov))),
-        skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
-        is_ambiguous=pair.is_ambiguous,
-        excess=excess,
-        dof=2 * max(n_effective - d, 1.0) * len(f) / inflation,
-        n_frequencies=len(f),
-    )
-
-
 def _delay_covariance(pair: _Pair, matrix: FloatArray, omega: FloatArray) -> FloatArray:
     """Return the covariance of delays, (d, d), without the factor for the correlation of bins."""
     crossed = np.einsum("ca,fab,gb->fcg", matrix, pair.weight, matrix)
     energy = omega**2 @ np.einsum("fcc->fc", crossed).real
     total = np.einsum("f,fcg,fcg->cg", omega**2, pair.noise, crossed).real
     return np.asarray(total / energy[:, None] / energy[None, :])
-
-
-def response_curve(
-    csm: ComplexArray,
-    frequency: FloatArray,
-    edges: FloatArray,
-    *,
-    dims: tuple[int, ...],
-    sensor: int,
-    reference: int,
-    n_effective: float,
-    correlation: FloatArray,
-    coherence: CanonicalCoherence | None = None,
-) -> ResponseCurve:
-    """Return the relative response in narrow bands.
-
-    Parameters
-    ----------
-    csm, frequency, dims, sensor, reference, n_effective, correlation, coherence
-        As for `calibrate_sensor`.
-    edges : float64, shape (n_bands + 1,)
-        Hz, ascending.
-    """
-    pair = _pair(
-        csm,
-        frequency,
-        dims=dims,
-        sensor=sensor,
-        reference=reference,
-        n_effective=n_effective,
-        band=(float(edges[0]), float(edges[-1])),
-        coherence=coherence,
-    )
-    d, n_bands = pair.response.shape[1], len(edges) - 1
-    matrix = np.full((n_bands, d, d), np.nan, dtype=np.complex128)
-    error = np.full((n_bands, d, d), np.nan)
-    number = np.searchsorted(edges, pair.frequency, side="right") - 1
-    centre = np.sqrt(edges[1:] * edges[:-1])
-    for band in range(n_bands):
-        inside: BoolArray = number == band
-        if not inside.any():
-            continue
-        weight = pair.weight[inside]
-        information = weight.sum(axis=0)
-        total = np.einsum("fca,fab->cb", pair.response[inside], weight)
-        matrix[band] = np.linalg.solve(information.T, total.T).T
-        inverse = np.linalg.inv(information)
-        own = np.einsum("fcc->fc", pair.noise[inside]).real
-        middle = np.einsum("fc,fab->cab", own, weight)
-        variance = np.einsum("ia,cab,bi->ci", inverse, middle, inverse).real
-        n_lags = int(inside.sum())
-        inflation = 1 + 2 * float(np.sum(correlation[1:n_lags]))
-        error[band] = np.sqrt(np.maximum(variance, 0.0) * inflation / 2)
-        centre[band] = float(pair.frequency[inside].mean())
-    return ResponseCurve(sensor, reference, centre, matrix, error)

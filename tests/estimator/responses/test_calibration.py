@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
-from estimator.responses.calibration import SensorCalibration, calibrate_sensor, response_curve
+from estimator.responses.calibration import CommonMotion, SensorCalibration
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 
@@ -39,17 +39,13 @@ def averaged(seed: int, *, noise: float = 0.1) -> CrossSpectra:
     return spectra
 
 
+def motion_of(spectra: CrossSpectra, factor: FloatArray | float = 1.0) -> CommonMotion:
+    csm, frequency = spectra.csm() * factor, spectra.settings.frequencies
+    return CommonMotion(csm, frequency, DIMS, 0, spectra.n_effective, CORRELATION)
+
+
 def calibrated(spectra: CrossSpectra, band: tuple[float, float] = (1.0, 20.0)) -> SensorCalibration:
-    return calibrate_sensor(
-        spectra.csm(),
-        spectra.settings.frequencies,
-        dims=DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=spectra.n_effective,
-        band=band,
-        correlation=CORRELATION,
-    )
+    return motion_of(spectra).calibrated(1, band)
 
 
 def test_without_noise_all_values_are_exact() -> None:
@@ -114,16 +110,9 @@ def scores(
     own = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
     samples = np.tile(motion, (1, len(snr), 1)) + noise * own
     csm = np.asarray(samples @ samples.conj().swapaxes(1, 2) / n, dtype=np.complex128)
-    found = calibrate_sensor(
-        csm,
-        np.asarray(1.0 + 0.5 * np.arange(n_freqs), dtype=np.float64),
-        dims=(d,) * len(snr),
-        sensor=1,
-        reference=0,
-        n_effective=n,
-        band=(0.9, 1.0 + 0.5 * n_freqs),
-        correlation=np.ones(1),
-    )
+    frequency = np.asarray(1.0 + 0.5 * np.arange(n_freqs), dtype=np.float64)
+    common = CommonMotion(csm, frequency, (d,) * len(snr), 0, n, np.ones(1))
+    found = common.calibrated(1, (0.9, 1.0 + 0.5 * n_freqs))
     truth = {"matrix": np.eye(d), "gain": 1.0, "delay": 0.0}
     return np.concatenate(
         [
@@ -171,49 +160,22 @@ def test_a_line_in_the_noise_keeps_its_small_weight() -> None:
     csm, f = spectra.csm(), spectra.settings.frequencies
     usual = calibrated(spectra)
     csm[np.argmin(np.abs(f - 10.0)), 3:6, 3:6] += 1e4 * np.eye(3) * csm[0, 0, 0].real
-    found = calibrate_sensor(
-        csm,
-        f,
-        dims=DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=spectra.n_effective,
-        band=(1.0, 20.0),
-        correlation=CORRELATION,
-    )
+    motion = CommonMotion(csm, f, DIMS, 0, spectra.n_effective, CORRELATION)
+    found = motion.calibrated(1, (1.0, 20.0))
     np.testing.assert_allclose(found.gain.error, usual.gain.error, rtol=0.1)
 
 
 def test_a_response_that_varies_over_the_band_is_detected() -> None:
     spectra = averaged(3, noise=0.02)
-    csm = spectra.csm()
-    rising = np.ones((len(csm), 9))
+    rising = np.ones((len(spectra.settings.frequencies), 9))
     rising[:, 3:6] += 0.06 * spectra.settings.frequencies[:, None] / 25
-    found = calibrate_sensor(
-        csm * rising[:, :, None] * rising[:, None, :],
-        spectra.settings.frequencies,
-        dims=DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=spectra.n_effective,
-        band=(1.0, 20.0),
-        correlation=CORRELATION,
-    )
+    found = motion_of(spectra, rising[:, :, None] * rising[:, None, :]).calibrated(1, (1.0, 20.0))
     assert found.excess > 1.5
 
 
 def test_curves_follow_the_response() -> None:
     spectra = averaged(4)
-    found = response_curve(
-        spectra.csm(),
-        spectra.settings.frequencies,
-        np.geomspace(1.0, 20.0, 7),
-        dims=DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=spectra.n_effective,
-        correlation=CORRELATION,
-    )
+    found = motion_of(spectra).curve(1, np.geomspace(1.0, 20.0, 7))
     truth = TRUE * np.exp(-2j * np.pi * found.frequency * DELAY)[:, None, None]
     for part in ("real", "imag"):
         score = (getattr(found.matrix, part) - getattr(truth, part)) / found.error

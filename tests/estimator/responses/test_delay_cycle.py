@@ -10,7 +10,7 @@ import pytest
 from estimator.checks.advice_on_sensors import Delay, ReversedPolarity
 from estimator.checks.relative_response import cycle_is_ambiguous, relative_response
 from estimator.checks.rules import orientation
-from estimator.responses.calibration import calibrate_sensor
+from estimator.responses.calibration import CommonMotion
 from estimator.types import ComplexArray, FloatArray
 
 NARROW = np.asarray(20.0 + 0.5 * np.arange(4), dtype=np.float64)
@@ -54,16 +54,7 @@ def test_a_wide_band_or_little_noise_decides(f: FloatArray, snr: float) -> None:
 
 @pytest.mark.parametrize("f", [NARROW, WIDE], ids=["narrow", "wide"])
 def test_an_ambiguous_delay_is_not_known(f: FloatArray) -> None:
-    found = calibrate_sensor(
-        drawn(1, f, 6.0),
-        f,
-        dims=DIMS,
-        sensor=1,
-        reference=0,
-        n_effective=N,
-        band=(15.0, 25.0),
-        correlation=np.ones(1),
-    )
+    found = CommonMotion(drawn(1, f, 6.0), f, DIMS, 0, N, np.ones(1)).calibrated(1, (15.0, 25.0))
     assert found.is_ambiguous == (f is NARROW)
     assert np.isnan(found.delay.value).all() == found.is_ambiguous
     assert np.isfinite(found.skew.value).all()
