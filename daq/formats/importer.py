@@ -523,19 +523,9 @@ def _bench_name(out: Path) -> str:
 
 
 def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:
-    dtypes = [stretch.counts.dtype for stretch in foreign.stretches]
-    return SensorLayout(
-        name=described.name,
-        channels=described.channels,
-        sampling_rate=described.sampling_rate,
-        dtype=np.result_type(*dtypes),
-        clock=described.clock or described.name,
-        model=described.model,
-        serial_number=described.serial_number,
-        driver=described.driver,
-        port=described.port,
-        absent=foreign.absent,
-    )
+    dtype = np.result_type(*(stretch.counts.dtype for stretch in foreign.stretches))
+    clock = described.clock_name(shares_clock=False)
+    return SensorLayout.of(described, dtype, clock, foreign.absent)
 
 
 def _write(writer: ArrayWriter, sensors: Sequence[ForeignSensor]) -> None:

@@ -293,6 +293,7 @@ class _Recorder:
             if not isinstance(failure, DeviceError):
                 raise failure  # an error in the bench file or in the program, not of a device
         if failures:
+            driver = connection.driver
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
         return True
 
@@ -304,7 +305,8 @@ class _Recorder:
         for connection in connections:
             information = {i.sensor: i for i in connection.information}
             for sensor in connection.sensors:
-                layout = SensorLayout.of(sensor, connection.driver)
+                clock = sensor.clock_name(shares_clock=driver.shares_clock)
+                layout = SensorLayout.of(sensor, driver.counts_dtype(sensor), clock)
                 found = information.get(sensor.name)
                 if found is not None:
                     layout = replace(
@@ -316,8 +318,7 @@ class _Recorder:
                         temperature=found.temperature,
                     )
                 layouts[sensor.name] = layout
-                states = connection.driver.states_temperature
-                if layout.temperature is None and not states:
+                if layout.temperature is None and not driver.states_temperature:
                     thermometers |= _thermometer(sensor)
         ordered = [layouts[sensor.name] for sensor in self.bench.sensors]
         self._started = self._file_started = self.clock.now()

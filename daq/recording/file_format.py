@@ -15,9 +15,8 @@ from estimator.records import dataclass
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import DTypeLike, NDArray
 
-    from daq.bench.driver_rules import DriverRules
     from daq.bench.model import Sensor
     from daq.bench.response import PolesZeros, Response
 
@@ -127,18 +126,25 @@ class SensorLayout:
         return FORMAT_VERSION if self.absent is not None and len(self.absent) else 2
 
     @classmethod
-    def of(cls, sensor: Sensor, driver: DriverRules) -> SensorLayout:
+    def of(
+        cls,
+        sensor: Sensor,
+        dtype: DTypeLike,
+        clock: str,
+        absent: NDArray[np.int64] | None = None,
+    ) -> SensorLayout:
         """Return the layout of a sensor of a bench file."""
         return cls(
             name=sensor.name,
             channels=sensor.channels,
             sampling_rate=sensor.sampling_rate,
-            dtype=np.dtype(driver.counts_dtype(sensor)),
-            clock=sensor.clock_name(shares_clock=driver.shares_clock),
+            dtype=np.dtype(dtype),
+            clock=clock,
             model=sensor.model,
             serial_number=sensor.serial_number,
             driver=sensor.driver,
             port=sensor.port,
+            absent=absent,
         )
 
 

@@ -213,14 +213,4 @@ def _layout(sensor: Sensor, scenario: Scenario) -> SensorLayout:
     counts: np.dtype[np.generic] = np.dtype(np.int32)
     if sensor.driver != SIMULATED:
         counts = driver_type(sensor.driver).counts_dtype(sensor)
-    return SensorLayout(
-        name=sensor.name,
-        channels=sensor.channels,
-        sampling_rate=sensor.sampling_rate,
-        dtype=counts,
-        clock="world" if shared else sensor.name,
-        model=sensor.model,
-        serial_number=sensor.serial_number,
-        driver=sensor.driver,
-        port=sensor.port,
-    )
+    return SensorLayout.of(sensor, counts, "world" if shared else sensor.name)

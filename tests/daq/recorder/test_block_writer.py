@@ -66,7 +66,7 @@ class Run:
 def running(path: Path) -> Iterator[Run]:
     clock = ManualClock()
     (sensor,) = bench("a").sensors
-    layout = SensorLayout.of(sensor, PlayedDriver())
+    layout = SensorLayout.of(sensor, PlayedDriver().counts_dtype(sensor), "a")
     writer = RecordingWriter.create(path, sensors=[layout], created=clock.now())
     try:
         with Recording.open(path) as recording:
