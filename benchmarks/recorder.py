@@ -20,6 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from daq.estimation.follow import SHORTEST_INTERVAL, follow
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.python_process import python_command
-from daq.recorder.recorder import run as record
+from daq.recorder.recorder import record
+from daq.recorder.recorder import run as run_to_its_end
 from daq.recording.monitor import RecordingStatus
 from daq.recording.repair import verify
 
@@ -125,7 +127,8 @@ def measure(bench_file: str, path: str, duration: float) -> None:
         if not begin:  # everything is connected and flows
             begin.extend((used(), time.monotonic()))
 
-    status = record(bench, path, duration=duration, acknowledged=acknowledged)
+    recording = partial(record, bench, path, duration=duration, acknowledged=acknowledged)
+    status = run_to_its_end(recording)
     cpu = (used() - begin[0]) / (time.monotonic() - begin[1])
     memory = peak_memory()
     missing = sum(sensor.missing for sensor in status.sensors.values())

@@ -18,7 +18,7 @@ import logging
 import math
 import shutil
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -102,18 +102,18 @@ class RecorderStatus:
 
 
 def run(
-    bench: Bench,
-    path: str | Path,
-    *,
-    duration: float | None = None,
-    attributes: Mapping[str, str] = MappingProxyType({}),
-    anyway: bool = False,
-    share_of_repeats: ShareOfRepeats | None = None,
-    clock: HostClock | None = None,
+    recording: Callable[..., Coroutine[Any, Any, RecorderStatus]],
     loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None,
-    acknowledged: Callable[[RecorderStatus], None] | None = None,
 ) -> RecorderStatus:
-    """Record until done, SIGINT or SIGTERM, in the main thread; see :func:`record`."""
+    """Record until done, SIGINT or SIGTERM, in the main thread.
+
+    Parameters
+    ----------
+    recording : callable
+        :func:`record` with all arguments but ``stop``.
+    loop_factory : callable, optional
+        Makes the event loop.
+    """
 
     async def main() -> RecorderStatus:
         stop = asyncio.Event()
@@ -123,17 +123,7 @@ def run(
                 loop.add_signal_handler(number, stop.set)
             except NotImplementedError:  # Windows
                 signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
-        return await record(
-            bench,
-            path,
-            duration=duration,
-            attributes=attributes,
-            anyway=anyway,
-            share_of_repeats=share_of_repeats,
-            clock=clock,
-            stop=stop,
-            acknowledged=acknowledged,
-        )
+        return await recording(stop=stop)
 
     runner = asyncio.Runner(loop_factory=loop_factory)
     try:
@@ -293,7 +283,6 @@ class _Recorder:
             if not isinstance(failure, DeviceError):
                 raise failure  # an error in the bench file or in the program, not of a device
         if failures:
-            driver = connection.driver
             raise ExceptionGroup(f"{len(failures)} ports cannot be used", failures)
         return True
 
@@ -304,6 +293,7 @@ class _Recorder:
         thermometers: dict[str, tuple[int, float]] = {}
         for connection in connections:
             information = {i.sensor: i for i in connection.information}
+            driver = connection.driver
             for sensor in connection.sensors:
                 clock = sensor.clock_name(shares_clock=driver.shares_clock)
                 layout = SensorLayout.of(sensor, driver.counts_dtype(sensor), clock)

@@ -81,6 +81,7 @@ def record(
 
     from daq.devices.bench_file import load
     from daq.host_clock import SystemClock
+    from daq.recorder.recorder import record as recorded
     from daq.recorder.recorder import run
     from daq.transport.wire_log import logging_to
     from estimator.checks.count_limits import share_of_repeats
@@ -110,7 +111,7 @@ def record(
     clock, loop_factory = host_time(bench)
     attributes = {"until": condition.estimated.text, "estimate": estimate or ""}
     made = partial(
-        run,
+        recorded,
         bench,
         out,
         duration=duration,
@@ -118,7 +119,6 @@ def record(
         anyway=anyway,
         share_of_repeats=share_of_repeats,
         clock=clock,
-        loop_factory=loop_factory,
     )
     screen = notices()
     gaps = GapLog()
@@ -131,9 +131,9 @@ def record(
                     gaps.look(now)
                     live.update(progress_line(now, duration))
 
-                status = made(acknowledged=show)
+                status = run(partial(made, acknowledged=show), loop_factory)
         else:
-            status = made(acknowledged=gaps.look)
+            status = run(partial(made, acknowledged=gaps.look), loop_factory)
     if status.closed:
         _sign(bench, Path(status.path))
         closed = {"recording": status.path}

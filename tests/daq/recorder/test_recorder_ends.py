@@ -147,8 +147,10 @@ if "windows" in sys.argv:
     asyncio.SelectorEventLoop.add_signal_handler = not_here
 device = PlayedDevice(may_end=asyncio.Event() if "stubborn" in sys.argv else None)
 driver = PlayedDriver({"a": device})
-recorder.record = functools.partial(recorder.record, drivers=driver.find)
-print(recorder.run(bench("a"), sys.argv[1], acknowledged=interrupt).closed, flush=True)
+recording = functools.partial(
+    recorder.record, bench("a"), sys.argv[1], acknowledged=interrupt, drivers=driver.find
+)
+print(recorder.run(recording).closed, flush=True)
 """
 
 

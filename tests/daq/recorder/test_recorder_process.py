@@ -33,14 +33,15 @@ MAX_SEARCH = 20 * 3600 * 200
 # Records the bench in argv[1] and prints what is acknowledged.
 RECORDER = """
 import json, sys
+from functools import partial
 from daq.devices.bench_file import load
-from daq.recorder.recorder import run
+from daq.recorder.recorder import record, run
 from tui.simulation.host_time import host_time
 def say(status):
     print(json.dumps(status.to_dict()), flush=True)
 bench = load(sys.argv[1])
 clock, loop_factory = host_time(bench)
-run(bench, sys.argv[2], clock=clock, loop_factory=loop_factory, acknowledged=say)
+run(partial(record, bench, sys.argv[2], clock=clock, acknowledged=say), loop_factory)
 """
 
 
