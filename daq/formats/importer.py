@@ -163,14 +163,38 @@ def import_files(
     """
     files = [response] if isinstance(response, Path) else list(response)
     with TemporaryDirectory(prefix="huddle-") as folder:
-        return _import(
-            _fetched(sources, files, selection or Selection(), Path(folder)),
+        fetched = _fetched(sources, files, selection or Selection(), Path(folder))
+        opened = open_sources(fetched.files, selection, sampling_rate=sampling_rate)
+        found = {name: fetched.named(sensor) for name, sensor in opened.sensors.items()}
+        if bench is not None:
+            found = _ordered(found, bench)
+        described, taken = _all_described(
+            found, bench, responses_in(fetched.responses, response_for)
+        )
+        sensors = tuple(described.values())
+        suggested, reasons = (
+            _suggested(tuple(found.values()), sensors) if bench is None else (bench.estimate, {})
+        )
+        settings = suggested if estimate is None else estimate(suggested)
+        if estimate is not None:
+            _refuse_misfits(settings, sensors)
+        written = _bench(out, bench, sensors, settings)
+        start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
+        with ArrayWriter(
             out,
-            bench=bench,
-            response_for=response_for,
-            sampling_rate=sampling_rate,
-            estimate=estimate,
-            selection=selection,
+            written,
+            sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
+            created=HostTime(start, start),
+            attributes={"origin": _origin(sources), **dict.fromkeys(_caveats(fetched), 1)},
+            chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
+        ) as writer:
+            _write(writer, tuple(found.values()))
+        return ImportResult(
+            tuple(_imported(sensor) for sensor in found.values()),
+            opened.problems,
+            opened.left_aside,
+            taken,
+            still_chosen(reasons, suggested, settings),
         )
 
 
@@ -210,48 +234,6 @@ def _fetched(
         if not responses:
             found.append(fetched.responses)
     return _Sources(sources, files, found, folder)
-
-
-def _import(
-    sources: _Sources,
-    out: Path,
-    *,
-    bench: Bench | None,
-    response_for: Sequence[tuple[str, Path]],
-    sampling_rate: float | None,
-    estimate: Callable[[EstimateSettings], EstimateSettings] | None,
-    selection: Selection | None,
-) -> ImportResult:
-    opened = open_sources(sources.files, selection, sampling_rate=sampling_rate)
-    found = {name: sources.named(sensor) for name, sensor in opened.sensors.items()}
-    if bench is not None:
-        found = _ordered(found, bench)
-    described, taken = _all_described(found, bench, responses_in(sources.responses, response_for))
-    sensors = tuple(described.values())
-    suggested, reasons = (
-        _suggested(tuple(found.values()), sensors) if bench is None else (bench.estimate, {})
-    )
-    settings = suggested if estimate is None else estimate(suggested)
-    if estimate is not None:
-        _refuse_misfits(settings, sensors)
-    written = _bench(out, bench, sensors, settings)
-    start = min(sensor.stretches[0].start_utc_ns for sensor in found.values())
-    with ArrayWriter(
-        out,
-        written,
-        sensors=[_layout(described[name], sensor) for name, sensor in found.items()],
-        created=HostTime(start, start),
-        attributes={"origin": _origin(sources.given), **dict.fromkeys(_caveats(sources), 1)},
-        chunk_seconds=BLOCK_ROWS / max(sensor.sampling_rate for sensor in found.values()),
-    ) as writer:
-        _write(writer, tuple(found.values()))
-    return ImportResult(
-        tuple(_imported(sensor) for sensor in found.values()),
-        opened.problems,
-        opened.left_aside,
-        taken,
-        still_chosen(reasons, suggested, settings),
-    )
 
 
 def open_files(
