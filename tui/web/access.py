@@ -28,7 +28,7 @@ import os
 import secrets
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -199,12 +199,10 @@ class Ended:
     ----------
     path : Path
         A line of JSON for each: its number and the end of its cookie.
-    now : callable
-        UTC in s since 1970.
     """
 
-    def __init__(self, path: Path, now: Callable[[], float] = time.time) -> None:
-        self._path, self._now = path, now
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._ends: dict[str, float] = {}
         with contextlib.suppress(FileNotFoundError):
             for line in path.read_text(encoding="utf-8").splitlines():
@@ -233,8 +231,7 @@ class Ended:
 class _Attempts:
     """Wrong secrets by what they count against, the newest last."""
 
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
+    def __init__(self) -> None:
         self._times: OrderedDict[tuple[str, ...], list[float]] = OrderedDict()
 
     def begin(self, limits: Mapping[tuple[str, ...], int]) -> None:
@@ -302,7 +299,7 @@ class Access:
             if (secret := _resolved(line)) is not None
         }
         self._key, self._ended = key, ended
-        self._attempts = _Attempts(time.time)
+        self._attempts = _Attempts()
 
     @property
     def is_open(self) -> bool:

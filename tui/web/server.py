@@ -439,7 +439,8 @@ class Server:
             found = await run_in_threadpool(lambda: numbers(state, choice_of(state, asked)))
         except (ValueError, OverflowError) as error:
             return Response(str(error), HTTPStatus.BAD_REQUEST)
-        return _json(found)
+        text = json.dumps(found, ensure_ascii=False)
+        return Response(text, media_type="application/json")
 
     async def _list(self, request: Request) -> Response:
         asked = request.query_params
@@ -697,39 +698,27 @@ class Server:
         after = form.get("next") or request.query_params.get("next", "/")
         after = after if after[:1] == "/" and after[1:2] not in {"/", "\\"} else "/"
         name = "".join(c for c in form.get("name", "") if c.isprintable()).strip()[:64]
-        problem, code = "", HTTPStatus.OK
-        if request.method == "POST" and name:
-            client, given = client_of(request), form.get("secret", "")
-            try:
-                async with self._checking:
-                    cookie = await run_in_threadpool(self._access.log_in, client, name, given)
-            except TooManyAttemptsError as error:
-                problem, code = str(error), HTTPStatus.TOO_MANY_REQUESTS
-                headers = {"retry-after": str(error.seconds)}
-                response = self._login_page(request, problem, code, name, after)
-                response.headers.update(headers)
-                return response
-            if cookie is not None:
-                _LOGGER.info("%s logged in from %s", name, client)
-                response = _see(after)
-                response.set_cookie(
-                    self._place.cookie,
-                    cookie,
-                    httponly=True,
-                    samesite="strict",
-                    secure=request.scope["scheme"] == "https",
-                )
-                return response
+        shown: dict[str, Any] = {"title": "Log in", "problem": "", "name": name, "next": after}
+        if request.method == "GET" or not name:
+            return self._page(request, "login", **shown)
+        client, given = client_of(request), form.get("secret", "")
+        try:
+            async with self._checking:
+                cookie = await run_in_threadpool(self._access.log_in, client, name, given)
+        except TooManyAttemptsError as error:
+            shown["problem"] = str(error)
+            response = self._page(request, "login", code=HTTPStatus.TOO_MANY_REQUESTS, **shown)
+            response.headers["retry-after"] = str(error.seconds)
+            return response
+        if cookie is None:
             _LOGGER.warning("wrong password for the pages from %s", client)
-            problem, code = "This password or token is wrong.", HTTPStatus.FORBIDDEN
-        return self._login_page(request, problem, code, name, after)
-
-    def _login_page(
-        self, request: Request, problem: str, code: int, name: str, after: str
-    ) -> Response:
-        return self._page(
-            request, "login", code=code, title="Log in", problem=problem, name=name, next=after
-        )
+            shown["problem"] = "This password or token is wrong."
+            return self._page(request, "login", code=HTTPStatus.FORBIDDEN, **shown)
+        _LOGGER.info("%s logged in from %s", name, client)
+        response, is_secure = _see(after), request.scope["scheme"] == "https"
+        how: Any = {"httponly": True, "samesite": "strict", "secure": is_secure}
+        response.set_cookie(self._place.cookie, cookie, **how)
+        return response
 
     async def _log_out(self, request: Request) -> Response:
         _check_form(request, await _form(request))
@@ -889,10 +878,6 @@ def _chart(state: State, asked: Mapping[str, str]) -> dict[str, Any]:
         "channels": [] if snapshot is None else [label.name for label in snapshot.channels],
         "units": [] if snapshot is None else [each.name for each in units_of(snapshot.unit)],
     }
-
-
-def _json(document: dict[str, Any]) -> Response:
-    return Response(json.dumps(document, ensure_ascii=False), media_type="application/json")
 
 
 def _download(content: bytes, kind: str, name: str) -> Response:
