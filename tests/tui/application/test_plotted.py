@@ -49,9 +49,7 @@ def test_upper_bounds_are_within_the_plot_and_no_levels() -> None:
         *(np.arange(1.0, 6.0), means),
         edges=np.arange(4),
         label="multi-part",
-        style="",
-        band_style="",
-        marker="",
+        style=("", "", ""),
     )
     assert np.isnan(curve.level_db).all()
     low, highest = level_limits([curve])

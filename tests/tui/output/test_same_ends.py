@@ -81,9 +81,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
             found.of_channel(column),
             edges=edges,
             label="",
-            style="",
-            band_style="",
-            marker="",
+            style=("", "", ""),
         )
         assert curve.high_db[0] == pytest.approx(decibels(float(high[column])), rel=1e-12)
         if low[column] > 0:

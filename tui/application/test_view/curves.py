@@ -99,18 +99,17 @@ def noise_curve(
     *,
     edges: NDArray[np.int64],
     label: str,
-    style: str,
-    band_style: str,
-    marker: str,
+    style: tuple[str, str, str],
     stepped: bool = False,
 ) -> Curve:
-    """Return the levels of a channel as a curve with the 95 % interval of each of its points."""
+    """Return the levels of a channel as a curve with the 95 % interval of each of its points.
+
+    `style` is that of the curve, of its interval, and the marker.
+    """
     ends = np.log10(frequency[edges])
     return Curve(
-        label=label,
-        style=style,
-        band_style=band_style,
-        marker=marker,
+        label,
+        *style,
         log_frequency=_centres(frequency, edges),
         level_db=levels_db(np.where(means.outside, np.nan, means.mean)),
         low_db=levels_db(np.where(np.isinf(means.low), np.nan, means.low)),

@@ -176,14 +176,7 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     for method in choice.methods:
         if method in snapshot.results:
             shown.append(
-                _noise(
-                    *(result, column),
-                    method=method,
-                    label=method,
-                    style=STYLES[method],
-                    n_points=n_points,
-                    bins=choice.bins,
-                )
+                _noise(result, column, method, choice, n_points, label=method, style=STYLES[method])
             )
     return shown
 
@@ -197,12 +190,9 @@ def _compared(
         return []
     return [
         _noise(
-            *(result, column),
-            method=method,
+            *(result, column, method, choice, n_points),
             label=result.snapshot.channels[column].name,
             style=(COLOURS[n % len(COLOURS)], "", MARKERS[n % len(MARKERS)]),
-            n_points=n_points,
-            bins=choice.bins,
         )
         for n, column in sorted(enumerate(columns), key=lambda each: each[1] == choice.channel)
     ]
@@ -211,15 +201,15 @@ def _compared(
 def _noise(
     result: Result,
     column: int,
-    *,
     method: str,
+    choice: Choice,
+    n_points: int,
+    *,
     label: str,
     style: tuple[str, str, str],
-    n_points: int,
-    bins: bool,
 ) -> Curve:
     snapshot = result.snapshot
-    n_bands = n_points if bins else steps_of(snapshot, n_points)
+    n_bands = n_points if choice.bins else steps_of(snapshot, n_points)
     edges = log_edges(snapshot.frequency, n_bands)
     found = result.spectrum(method).levels(edges)
     return noise_curve(
@@ -227,10 +217,8 @@ def _noise(
         found.of_channel(column),
         edges=edges,
         label=label,
-        style=style[0],
-        band_style=style[1],
-        marker=style[2],
-        stepped=not bins,
+        style=style,
+        stepped=not choice.bins,
     )
 
 
@@ -257,16 +245,8 @@ def _reference(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     methods = [method for method in choice.methods if method in before.results]
     if not columns or not methods:
         return []
-    return [
-        _noise(
-            *(reference.result, columns[0]),
-            method=methods[0],
-            label=reference.path.stem,
-            style=REFERENCE_STYLE,
-            n_points=n_points,
-            bins=choice.bins,
-        )
-    ]
+    about = reference.result, columns[0], methods[0], choice, n_points
+    return [_noise(*about, label=reference.path.stem, style=REFERENCE_STYLE)]
 
 
 def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
