@@ -184,6 +184,11 @@ class Schemas:
             if keys[each.name].endswith("utc_ns"):
                 made["minimum"] = None  # before 1970
             yield keys[each.name], _known(made), True
+        for key, name in getattr(kind, "IN_JSON", {}).items():
+            found = getattr(kind, name)
+            made = self.of(eval(found.fget.__annotations__["return"], _names(kind.__module__)))  # noqa: S307 - ours
+            text = _NULL.sub("null", plain_text(inspect.getdoc(found) or ""))
+            yield key, made | {"description": text}, True
 
     def document(self, kind: Any) -> Schema:  # noqa: ANN401 - any type
         """Return the schema of a document; of several, that of all their keys."""

@@ -118,3 +118,10 @@ def json_key(each: Field[Any]) -> str | None:
         return name
     found = _UNIT.search(str(each.type))
     return f"{each.name}_{UNITS[found[1]]}" if found else each.name
+
+
+def json_keys(kind: type[Any]) -> Mapping[str, str]:
+    """Return the attributes of a class in JSON, by key: fields, and properties by its `IN_JSON`."""
+    keys = {json_key(each): each.name for each in _fields(kind)}
+    keys |= getattr(kind, "IN_JSON", {})
+    return {key: name for key, name in keys.items() if key is not None}

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cache
 from statistics import NormalDist
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,14 +71,19 @@ class Budget:
 
     Attributes
     ----------
-    sensor, channel : str
+    sensor : str
+        Name of the sensor.
+    channel : str
+        Name of the channel.
     quantity : str
-        "sensitivity" (in counts per unit, if absolute; else relative to that of the bench file) or
-        "noise" (PSD).
+        sensitivity: in counts per unit if `is_absolute`, otherwise relative to the bench file;
+        noise: PSD by the calibrated sensitivities.
     low, high : float
         Band, Hz.
     value : float
+        The value.
     components : tuple of Component
+        Lines of the budget.
     confidence : float
     is_absolute : bool
         Whether the value rests on a certificate.
@@ -88,14 +94,26 @@ class Budget:
 
     sensor: str
     channel: str
-    quantity: str
-    low: float
-    high: float
+    quantity: str = field(metadata={"enum": ("sensitivity", "noise")})
+    low: float = field(metadata=NOT_IN_JSON)
+    high: float = field(metadata=NOT_IN_JSON)
     value: float
     components: tuple[Component, ...]
-    confidence: float
+    confidence: float = field(metadata=NOT_IN_JSON)
     is_absolute: bool = False
-    ends: tuple[float, float] | None = None
+    ends: tuple[float, float] | None = field(default=None, metadata=NOT_IN_JSON)
+    IN_JSON: ClassVar[Mapping[str, str]] = {
+        "band_hz": "band",
+        "combined_relative": "combined",
+        "effective_degrees_of_freedom": "dof",
+        "k": "k",
+        "expanded_uncertainty": "expanded",
+    }
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Band."""
+        return self.low, self.high
 
     @property
     def combined(self) -> float:
@@ -104,7 +122,7 @@ class Budget:
 
     @property
     def dof(self) -> float:
-        """Effective degrees of freedom (Welch and Satterthwaite)."""
+        """Effective degrees of freedom (Welch and Satterthwaite); null in JSON: no limit."""
         total = sum(each.relative**4 / each.dof for each in self.components)
         return self.combined**4 / total if 0 < total < math.inf else STATED
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 import math
+from dataclasses import field
 
-from estimator.records import dataclass
+from estimator.records import NOT_IN_JSON, dataclass
 
 
 class Verdict(enum.StrEnum):
@@ -62,11 +63,13 @@ class Prediction:
     ----------
     seconds : float or None
         Total length after which a test that ends once it is decided is as likely to have ended as
-        not; None where `longest` does not.
-    earliest, latest : float or None
-        Between which lengths it has ended with a probability of 80 %.
+        not; None where `longest` is not long enough.
+    earliest : float or None
+        Length before which it has ended with a probability of 10 %.
+    latest : float or None
+        Length before which it has ended with a probability of 90 %.
     longest : float
-        The longest recording considered, in seconds.
+        Longest recording considered, in seconds.
     resolution_db : float
         Half the width of the interval in that recording, in dB, where the noise is closest to the
         limit.
@@ -81,14 +84,14 @@ class Prediction:
     """
 
     seconds: float | None
-    longest: float
+    longest: float = field(metadata={"type": "number"})
     resolution_db: float
     earliest: float | None
     latest: float | None
-    slowest: int
-    is_pass: bool
-    frequency: float = math.nan
-    is_bounded: bool = False
+    slowest: int = field(metadata=NOT_IN_JSON)
+    is_pass: bool = field(metadata=NOT_IN_JSON)
+    frequency: float = field(default=math.nan, metadata=NOT_IN_JSON)
+    is_bounded: bool = field(default=False, metadata=NOT_IN_JSON)
 
     @property
     def is_close(self) -> bool:

@@ -23,13 +23,13 @@ from daq.estimation.snapshot_diagnostics import EdgeLeakage, FrequencyDiagnosis
 from daq.results.decision.verdict import LimitResult
 from daq.results.noise_parameters import SheetComparison
 from daq.results.sources import LoggedEvent
-from daq.results.uncertainty_budget import Component
+from daq.results.uncertainty_budget import Budget
 from estimator.checks.advice import Rank, Untested
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.sensitivities import Cause
 from estimator.checks.stability import Stability
-from estimator.decision.verdict import Obstacle, Verdict
+from estimator.decision.verdict import Obstacle, Prediction, Verdict
 from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.noise_parameters.allan import AllanDeviation
@@ -37,6 +37,7 @@ from estimator.noise_parameters.fit import NoiseParameters
 from estimator.responses.calibration import SensorCalibration
 from estimator.spectra.segment_rejection import Reason
 from estimator.types import FloatArray, IntArray
+from tui.wording.verdict_text import Decision
 
 Finite: TypeAlias = Annotated[float, ("type", "number")]
 Row: TypeAlias = Annotated[FloatArray, 1]
@@ -271,20 +272,9 @@ class SlowestDocument(TypedDict):
     frequency_hz: Annotated[float, "Centre of the band where it does."]
 
 
-class PredictionDocument(TypedDict):
-    """How long a recording takes to decide."""
+class PredictionKeys(TypedDict):
+    """What JSON says of a prediction beside its fields."""
 
-    seconds: Annotated[
-        float | None,
-        "Total length after which a test that ends once it is decided is as likely to have ended "
-        "as not; null where the longest is not long enough.",
-    ]
-    earliest: Annotated[
-        float | None, "Length before which it has ended with a probability of 10 %."
-    ]
-    latest: Annotated[float | None, "Length before which it has ended with a probability of 90 %."]
-    longest: Annotated[Finite, "Longest recording considered, in seconds."]
-    resolution_db: Annotated[float, "Half the width of the interval in that recording, in dB."]
     slowest: Annotated[SlowestDocument, "What takes longest."]
 
 
@@ -301,19 +291,10 @@ class LimitMargins(TypedDict):
     margin_high_db: Annotated[float, "The margin at the lower end; null where that is not above 0."]
 
 
-class DecisionDocument(TypedDict):
-    """What a test comes to, in words; they can change between versions."""
-
-    state: Verdict
-    reason: Annotated[str, "The verdict in a sentence."]
-    next_step: Annotated[str, "What to do first, with the fact that needs it."]
-    remarks: Annotated[Sequence[str], "What else to do, and what is not judged."]
-
-
 class VerdictDocument(TypedDict):
     """Verdict on the limits of the bench file."""
 
-    decision: Annotated[DecisionDocument | None, "First line of other output; null without limits."]
+    decision: Annotated[Decision | None, "First line of other output; null without limits."]
     verdict: Annotated[
         Verdict | None, "Verdict on the limits of the bench file; null without limits."
     ]
@@ -323,7 +304,7 @@ class VerdictDocument(TypedDict):
         "Channels whose sensitivity the common motion contradicts.",
     ]
     record_for: Annotated[
-        PredictionDocument | None,
+        Annotated[Prediction, PredictionKeys] | None,
         "Length of a recording that would decide, where a longer recording would.",
     ]
     limits: Annotated[
@@ -504,27 +485,6 @@ class CalibratedKeys(TypedDict):
     curve: ResponseDocument
 
 
-class BudgetDocument(TypedDict):
-    """Uncertainty of one value of one channel in one band."""
-
-    sensor: Annotated[str, "Name of the sensor."]
-    channel: Annotated[str, "Name of the channel."]
-    quantity: Annotated[
-        str,
-        ("enum", ("sensitivity", "noise")),
-        "sensitivity: in counts per unit if is_absolute, otherwise relative to the bench file; "
-        "noise: PSD by the calibrated sensitivities.",
-    ]
-    is_absolute: Annotated[bool, "Whether the value rests on a certificate."]
-    band_hz: Annotated[tuple[Finite, Finite], "Band."]
-    value: Annotated[float, "The value."]
-    components: Annotated[tuple[Component, ...], "Lines of the budget."]
-    combined_relative: Annotated[float, "Combined standard uncertainty, as a fraction of it."]
-    effective_degrees_of_freedom: Annotated[float, "By Welch and Satterthwaite; null: no limit."]
-    k: Annotated[float, "Coverage factor."]
-    expanded_uncertainty: Annotated[float, "Expanded uncertainty, in the unit of the value."]
-
-
 class CalibrationDocument(TypedDict):
     """What huddle calibrate --json writes."""
 
@@ -537,7 +497,7 @@ class CalibrationDocument(TypedDict):
     sensors: Annotated[
         list[Annotated[SensorCalibration, CalibratedKeys]], "Each other sensor, over the band."
     ]
-    budgets: Annotated[list[BudgetDocument], "Of each channel, quantity and band."]
+    budgets: Annotated[tuple[Budget, ...], "Of each channel, quantity and band."]
 
 
 class DoubtedDocument(TypedDict):

@@ -7,7 +7,6 @@ docs/json.md describes it for people, ``tui/resources/result-2.schema.json`` for
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -19,7 +18,7 @@ from daq.results.sources import Source, conditions, uncounted_events
 from daq.results.uncertainty_budget import level_budget
 from estimator.checks.advice import Advice, Rank
 from estimator.checks.shared_noise import MAX_CHANNELS
-from estimator.records import json_key
+from estimator.records import json_keys
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
@@ -265,12 +264,7 @@ def verdict_document(result: Result) -> VerdictDocument:
         }
     prediction = found.prediction if found.verdict == "not-decided" else None
     return {
-        "decision": {
-            "state": decision.state,
-            "reason": decision.reason,
-            "next_step": decision.next_step,
-            "remarks": decision.remarks,
-        },
+        "decision": decision,
         "verdict": found.verdict,
         "obstacles": list(found.obstacles),
         "sensitivities": [
@@ -289,12 +283,8 @@ def verdict_document(result: Result) -> VerdictDocument:
         ],
         "record_for": None
         if prediction is None
-        else {
-            "seconds": prediction.seconds,
-            "earliest": prediction.earliest,
-            "latest": prediction.latest,
-            "longest": prediction.longest,
-            "resolution_db": prediction.resolution_db,
+        else plain(prediction)
+        | {
             "slowest": {
                 "channel": found.limits[prediction.slowest].name,
                 "frequency_hz": prediction.frequency,
@@ -349,8 +339,7 @@ def _numbers(fact: Fact) -> dict[str, Any]:
 
 
 def _beyond(base: type[Fact | Advice], found: Fact | Advice) -> dict[str, Any]:
-    common = {json_key(each) for each in fields(base)}
-    return {key: value for key, value in plain(found).items() if key not in common}
+    return {key: value for key, value in plain(found).items() if key not in json_keys(base)}
 
 
 def _finding(advice: Advice) -> FindingDocument:
@@ -392,22 +381,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> CalibrationD
             }
             for each in found.sensors
         ],
-        "budgets": [
-            {
-                "sensor": each.sensor,
-                "channel": each.channel,
-                "quantity": each.quantity,
-                "is_absolute": each.is_absolute,
-                "band_hz": (each.low, each.high),
-                "value": each.value,
-                "components": each.components,
-                "combined_relative": each.combined,
-                "effective_degrees_of_freedom": each.dof,
-                "k": each.k,
-                "expanded_uncertainty": each.expanded,
-            }
-            for each in found.budgets
-        ],
+        "budgets": found.budgets,
     }
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
 
-from estimator.records import json_key
+from estimator.records import json_keys
 from estimator.types import FloatArray
 
 LISTED = 1 << 16
@@ -23,8 +23,7 @@ def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any
     Arrays become what `array` makes of them; complex ones their real and imaginary parts.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        keys = ((json_key(each), each.name) for each in fields(value))
-        value = {key: getattr(value, name) for key, name in keys if key is not None}
+        value = {key: getattr(value, name) for key, name in json_keys(type(value)).items()}
     if isinstance(value, np.generic):
         value = np.asarray(value) if np.iscomplexobj(value) else value.item()
     if isinstance(value, np.ndarray):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import field
 from typing import TYPE_CHECKING
 
 from daq.results.decision.end import Goal, Remaining
@@ -10,7 +11,7 @@ from daq.results.decision.facts import LimitUndecided, WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict, facts_of_verdict
 from estimator.checks.advice import Rank
 from estimator.decision.verdict import REMOVED_BY_TIME, Obstacle, Verdict
-from estimator.records import dataclass
+from estimator.records import NOT_IN_JSON, dataclass
 from estimator.wording import few, percent, roughly, several, signed
 from tui.page.table import Cell, Tone
 from tui.wording.facts import NOTHING_TO_DO, brief, why_no_estimate
@@ -58,13 +59,17 @@ _NEXT_DAYS = 12 * 3600.0
 class Decision:
     """What a test comes to, in words: the first line of every output of a test with limits.
 
+    The words can change between versions.
+
     Attributes
     ----------
     state : Verdict
-    reason, next_step : str
-        In sentences, together two lines of 80 columns; every state has a next step.
+    reason : str
+        The verdict in a sentence.
+    next_step : str
+        What to do first, with the fact that needs it; with `reason`, two lines of 80 columns.
     remarks : tuple of str
-        What else keeps the test from a decision, and where limits are not judged, a line each.
+        What else to do, and what is not judged, a line each.
     fact : Fact or None
         Of the result, the one that `next_step` states; None if that is no fact of these.
     """
@@ -73,7 +78,7 @@ class Decision:
     reason: str
     next_step: str
     remarks: tuple[str, ...] = ()
-    fact: Fact | None = None
+    fact: Fact | None = field(default=None, metadata=NOT_IN_JSON)
 
     def __str__(self) -> str:
         return f"{self.reason} {self.next_step}"
