@@ -6,8 +6,9 @@ add a field here and use it in `daq.estimation`. This module imports nothing hea
 ``huddle --help`` reads it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, field, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, field, fields, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -28,7 +29,7 @@ class Option:
         Turns a value of the bench file into the value of the setting. Raises `ValueError` with what
         was expected.
     flags : tuple of str
-        Names on the command line; ``--yes/--no`` for a switch.
+        Names on the command line, if not by the field's; ``--yes/--no`` for a switch.
     metavar : str
         What the help shows for the value; empty for a switch.
     read : callable
@@ -46,8 +47,8 @@ class Option:
     """
 
     help: str
-    check: Callable[[Any], object]
-    flags: tuple[str, ...]
+    check: Callable[[Any], object] = values.yes_or_no
+    flags: tuple[str, ...] = ()
     metavar: str = ""
     read: Callable[[Any], object] = str
     show: Callable[[Any], object] = lambda value: value
@@ -88,7 +89,6 @@ class EstimateSettings:
         Option(
             "Length of a segment, such as 10s or 2min. It sets the frequency resolution.",
             check=parse_duration,
-            flags=("--segment",),
             metavar="TIME",
         ),
     ] = 10.0
@@ -97,7 +97,6 @@ class EstimateSettings:
         Option(
             "Overlap between consecutive segments, as a fraction of their length.",
             check=values.share,
-            flags=("--overlap",),
             metavar="FRACTION",
             read=values.to_number,
         ),
@@ -107,7 +106,6 @@ class EstimateSettings:
         Option(
             "Window of each segment: hann, blackman, rectangular, …; with a parameter: kaiser,8.",
             check=values.window,
-            flags=("--window",),
             metavar="NAME",
         ),
     ] = "hann"
@@ -115,8 +113,7 @@ class EstimateSettings:
         Literal["none", "constant", "linear"],
         Option(
             "Trend removed from each segment: none, constant, linear.",
-            check=values.trend,
-            flags=("--detrend",),
+            check=partial(values.one_of, known=values.TRENDS),
             metavar="TREND",
         ),
     ] = "constant"
@@ -124,7 +121,6 @@ class EstimateSettings:
         bool,
         Option(
             "Correct the bias of few averages.",
-            check=values.yes_or_no,
             flags=("--correction/--no-correction",),
         ),
     ] = True
@@ -133,8 +129,7 @@ class EstimateSettings:
         Option(
             "Time of samples: from arrival times, refined by the common motion (refined); from"
             " arrival times alone (arrivals); from the nominal rates (nominal).",
-            check=values.clocks,
-            flags=("--clocks",),
+            check=partial(values.one_of, known=values.CLOCKS),
             metavar="SOURCE",
         ),
     ] = "refined"
@@ -144,8 +139,7 @@ class EstimateSettings:
             "Filter sensors before the window so that all have one response: by the poles and zeros"
             " of the bench file (known), by the responses that the averages show (estimated),"
             " where unequal responses matter (auto), or not at all (off).",
-            check=values.equalisation,
-            flags=("--equalise",),
+            check=partial(values.one_of, known=values.EQUALISATIONS),
             metavar="MODE",
         ),
     ] = "auto"
@@ -154,8 +148,6 @@ class EstimateSettings:
         Option(
             "Also exclude segments with transients. Clipped segments are excluded unless"
             " --no-reject is given; for segments with gaps see --bridge.",
-            check=values.yes_or_no,
-            flags=("--reject/--no-reject",),
         ),
     ] = None
     bridge: Annotated[
@@ -165,7 +157,6 @@ class EstimateSettings:
             " in them, where fewer than half of the segments have no gap; 0 excludes them always."
             " Not with --octaves or --reject.",
             check=values.share,
-            flags=("--bridge",),
             metavar="SHARE",
             read=values.to_number,
         ),
@@ -176,7 +167,6 @@ class EstimateSettings:
             "Stretch of time of which no segment is used, such as a lorry that passed: two instants"
             " in UTC, or two times after the start of the recording (0s/60s); may be repeated.",
             check=values.stretches,
-            flags=("--exclude",),
             metavar="START/END",
             read=list,
             show=list,
@@ -189,8 +179,6 @@ class EstimateSettings:
         Option(
             "Subtract what squares and cubes of a channel explain of its noise, where it is not"
             " linear. Without, it widens the interval.",
-            check=values.yes_or_no,
-            flags=("--linearise/--no-linearise",),
         ),
     ] = False
     octaves: Annotated[
@@ -198,8 +186,6 @@ class EstimateSettings:
         Option(
             "Estimate each octave with its own segment length: --segment in the top octave,"
             " doubled in each octave below.",
-            check=values.yes_or_no,
-            flags=("--octaves/--no-octaves",),
         ),
     ] = False
     dimension: Annotated[
@@ -210,7 +196,6 @@ class EstimateSettings:
             " gradients of the motion where they explain it. Default: auto with method auto, else"
             " as many as a sensor has channels.",
             check=values.dimension,
-            flags=("--dimension",),
             metavar="N|auto",
             read=values.to_dimension,
         ),
@@ -250,7 +235,6 @@ class EstimateSettings:
             " of all of them (0.2), or of a sensor (B=0.2; may be repeated). Motion across an axis"
             " widens the intervals. Default: 1.",
             check=values.axis_tolerance,
-            flags=("--axis-tolerance",),
             metavar="DEGREES",
             read=values.to_axis_tolerance,
             show=values.number_or_table,
@@ -266,7 +250,6 @@ class EstimateSettings:
             "Change of a gain in percent, for motion of ten times the power, that method multi-part"
             " allows for (default 0.1).",
             check=values.not_negative,
-            flags=("--gain-steadiness",),
             metavar="PERCENT",
             read=values.to_number,
             text=repr,
@@ -278,7 +261,6 @@ class EstimateSettings:
             "Two of three or more sensors whose noise may be shared (A:B), as by a cable or a"
             " supply, for method multi-part; may be repeated.",
             check=values.pairs,
-            flags=("--shared-noise",),
             metavar="A:B",
             read=lambda texts: [text.split(":") for text in texts],
             show=lambda pairs: [list(pair) for pair in pairs],
@@ -293,7 +275,6 @@ class EstimateSettings:
             " towards two directions that all sensors have in common; may be repeated. What remains"
             " is its axis tolerance (default then: 0.1).",
             check=values.lean,
-            flags=("--lean",),
             metavar="SENSOR=A,B",
             read=values.to_lean,
             show=lambda leans: {name: list(angles) for name, angles in leans.items()},
@@ -306,7 +287,6 @@ class EstimateSettings:
         Option(
             "Unit of the motion, such as m/s², mm/s or µg. Spectra are in its square per Hz.",
             check=values.unit,
-            flags=("--unit",),
             metavar="UNIT",
         ),
     ] = None
@@ -316,7 +296,6 @@ class EstimateSettings:
             "Band of interest in Hz, such as 1:20, for the table of results, the target c.o.v. and"
             " the effect of the clocks.",
             check=values.band,
-            flags=("--band",),
             metavar="LOW:HIGH",
             read=values.to_band,
             show=list,
@@ -329,7 +308,6 @@ class EstimateSettings:
             "Target coefficient of variation of the noise in the worst third of an octave of the"
             " band, such as 0.05. With limits, how long a test takes is until they are decided.",
             check=values.cov,
-            flags=("--target-cov",),
             metavar="COV",
             read=values.to_number,
         ),
@@ -340,18 +318,21 @@ class EstimateSettings:
             "Target coefficient of variation of the noise at single frequencies of the band, in"
             " place of --target-cov.",
             check=values.cov,
-            flags=("--target-cov-bin",),
             metavar="COV",
             read=values.to_number,
         ),
     ] = None
 
 
-def _declared() -> dict[str, Option]:
-    return {each.name: each.type.__metadata__[0] for each in fields(EstimateSettings)}  # type: ignore[union-attr]  # all are Annotated
+def _declared() -> Iterator[tuple[str, Option]]:
+    for each in fields(EstimateSettings):
+        option: Option = each.type.__metadata__[0]  # type: ignore[union-attr]  # all are Annotated
+        name = each.name.replace("_", "-")
+        flag = f"--{name}/--no-{name}" if option.is_switch else f"--{name}"
+        yield each.name, replace(option, flags=option.flags or (flag,))
 
 
-OPTIONS: Mapping[str, Option] = MappingProxyType(_declared())
+OPTIONS: Mapping[str, Option] = MappingProxyType(dict(_declared()))
 """Every option, by the name of its field."""
 
 

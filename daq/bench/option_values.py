@@ -125,21 +125,6 @@ def method_or_methods(value: tuple[str, ...]) -> object:
     return value[0] if len(value) == 1 else list(value)
 
 
-def clocks(value: object) -> str:
-    """Return a source of sample times."""
-    return one_of(value, CLOCKS)
-
-
-def equalisation(value: object) -> str:
-    """Return a mode of equalisation."""
-    return one_of(value, EQUALISATIONS)
-
-
-def trend(value: object) -> str:
-    """Return a trend to remove."""
-    return one_of(value, TRENDS)
-
-
 def window(value: object) -> str:
     """Return the name of a window, with its parameter; also of a tuple, as scipy takes it."""
     if isinstance(value, (list, tuple)) and len(value) == 2 and isinstance(value[0], str):
