@@ -7,7 +7,6 @@ value, key and expectation. Errors between several values, and those that a driv
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from itertools import islice
 from pathlib import Path
@@ -29,7 +28,7 @@ from daq.bench.model import (
     valid_rate,
 )
 from daq.bench.option_fit import misfits, shortest_duration
-from daq.bench.option_values import LEAST_SENSORS
+from daq.bench.option_values import LEAST_SENSORS, expected_of
 from daq.bench.tables.toml_text import checked_table
 from daq.bench.units import in_si, is_motion
 from daq.errors import ABSENT, BenchFileError, FileFault, WrongSettingError
@@ -115,9 +114,8 @@ def _expectation(details: ErrorDetails, model: type[BaseModel] | None) -> str:
     if kind == "missing":
         return f"is missing; expected {description or 'a value'}"
     if kind == "extra_forbidden":
-        return (
-            f"unknown key; {one_of(name, tuple(each.alias or key for key, each in known.items()))}"
-        )
+        keys = tuple(each.alias or key for key, each in known.items())
+        return f"unknown key; {expected_of(name, keys)}"
     if kind == "string_too_short":
         return f"expected {description or 'a word'}"
     if kind == "too_short":
@@ -177,13 +175,6 @@ def _place(
     return key if key or sensor else "the file", sensor
 
 
-def one_of(value: str, known: Sequence[str]) -> str:
-    """Return the list of known words as an expectation, with the closest match."""
-    close = difflib.get_close_matches(value, known, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    return f"expected one of {', '.join(known) or '(none)'}{hint}"
-
-
 _TableT = TypeVar("_TableT", bound=BaseModel)
 
 
@@ -236,7 +227,7 @@ def _driver_faults(entry: object, drivers: Mapping[str, DriverRules]) -> Iterato
         return
     sensor, name = str(entry.get("name", "?")), entry["driver"]
     if name not in drivers:
-        yield FileFault("driver", one_of(name, tuple(drivers)), name, sensor)
+        yield FileFault("driver", expected_of(name, tuple(drivers)), name, sensor)
         return
     settings = entry.get("settings", {})
     model = drivers[name].settings
@@ -408,10 +399,10 @@ def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterat
         key = f'limits["{limit.name}"]'
         for name in limit.sensors:
             if name not in known_sensors:
-                yield FileFault(f"{key}.sensors", one_of(name, known_sensors), name)
+                yield FileFault(f"{key}.sensors", expected_of(name, known_sensors), name)
         for name in limit.channels:
             if name not in known_channels:
-                yield FileFault(f"{key}.channels", one_of(name, known_channels), name)
+                yield FileFault(f"{key}.channels", expected_of(name, known_channels), name)
         yield from _limit_unit_faults(limit, key, sensors)
 
 

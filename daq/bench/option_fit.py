@@ -6,7 +6,7 @@ from typing import Protocol
 
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import EstimateSettings
-from daq.bench.option_values import one_of
+from daq.bench.option_values import expected_of
 from estimator.records import dataclass
 
 MIN_SEGMENT_SAMPLES = 4
@@ -69,10 +69,8 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
         )
     known = (*(sensor.name for sensor in sensors), *channels)
     for name, gain in settings.gains.items():
-        try:
-            one_of(name, known)
-        except ValueError as error:
-            yield Misfit("gains", f"{name}={gain:g}", str(error))
+        if name not in known:
+            yield Misfit("gains", f"{name}={gain:g}", expected_of(name.lower(), known))
 
     names = [sensor.name for sensor in sensors]
     paired = [name for pair in settings.shared_noise for name in pair]
@@ -83,10 +81,8 @@ def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[
     for option in ("axis_tolerance", "lean", "sampling_rates", "shared_noise"):
         given = paired if option == "shared_noise" else getattr(settings, option)
         for name in filter(None, given):
-            try:
-                one_of(name, names)
-            except ValueError as error:
-                yield Misfit(option, name, str(error))
+            if name not in names:
+                yield Misfit(option, name, expected_of(name.lower(), names))
 
 
 def max_dimension(n_channels: int) -> int:

@@ -109,9 +109,14 @@ def one_of(value: object, known: Sequence[str]) -> str:
     """
     if isinstance(value, str) and value in known:
         return value
-    close = difflib.get_close_matches(str(value).lower(), known, n=1)
+    raise ValueError(expected_of(str(value).lower(), known))
+
+
+def expected_of(value: str, known: Sequence[str]) -> str:
+    """Return the known words as an expectation, with the closest one."""
+    close = difflib.get_close_matches(value, known, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise ValueError(f"expected one of {', '.join(known)}{hint}")
+    return f"expected one of {', '.join(known) or '(none)'}{hint}"
 
 
 def methods(value: object) -> tuple[str, ...]:

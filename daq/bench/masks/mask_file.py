@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from daq.bench.masks.mask import NOISE_MODELS, Mask, check_points
-from daq.bench.option_values import one_of
+from daq.bench.option_values import expected_of
 from daq.bench.units import DensityUnit
 from daq.errors import FileFault, HuddleError, WrongSettingError
 
@@ -70,10 +70,8 @@ def masks_named(text: str) -> tuple[Mask, ...]:
         elif Path(word).suffix.lower() in {".csv", ".txt", ".tsv"}:
             found.append(read_mask(word))
         else:
-            try:
-                one_of(word, tuple(NOISE_MODELS))
-            except ValueError as error:
-                raise WrongSettingError(f"{word!r}: {error}, or a CSV file") from None
+            expected = expected_of(word.lower(), tuple(NOISE_MODELS))
+            raise WrongSettingError(f"{word!r}: {expected}, or a CSV file")
     return tuple(found)
 
 
