@@ -6,7 +6,7 @@ import datetime as dt
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -37,6 +37,29 @@ from daq.errors import ABSENT, BenchFileError, FileFault
 Day: TypeAlias = dt.date
 
 
+def _made(kind: type, *others: type) -> BeforeValidator:
+    """Make an object of a plain class of its table, unless there is one already, or none."""
+
+    def make(table: object) -> object:
+        if table is None or isinstance(table, (kind, *others)):
+            return table
+        return kind(**dict(TABLES[kind].model_validate(table)))
+
+    return BeforeValidator(make)
+
+
+def _table_of(value: Any) -> object:  # noqa: ANN401 - of a plain class
+    """Return the table that an object was made of; none of a whole response.
+
+    That is kept with the samples: its hundreds of coefficients are nothing for people to read.
+    """
+    table = TABLES.get(type(value))
+    if table is None:
+        return None
+    values = {each.name: getattr(value, each.name) for each in fields(value)}
+    return table.model_construct(**values).model_dump(exclude_defaults=True)
+
+
 class ChannelCertificateTable(BenchTable):
     """The table of a channel's certificate, from which a `Certificate` is made."""
 
@@ -55,20 +78,6 @@ class ChannelCertificateTable(BenchTable):
         if isinstance(table, Mapping) and table.get("value") == 0:
             raise ValueError("value: expected counts per unit, not zero")
         return table
-
-
-def _certificate(table: object) -> object:
-    if table is None or isinstance(table, Certificate):
-        return table
-    return Certificate(**dict(ChannelCertificateTable.model_validate(table)))
-
-
-def _table_of_certificate(certificate: Certificate | None) -> object:
-    if certificate is None:
-        return None
-    return ChannelCertificateTable.model_construct(**asdict(certificate)).model_dump(
-        exclude_defaults=True
-    )
 
 
 def _pair_to_complex(value: object) -> object:
@@ -95,22 +104,6 @@ class PolesZerosTable(BenchTable):
     """Frequency in Hz at which the sensitivity holds."""
 
 
-def _poles_zeros(table: object) -> object:
-    if table is None or isinstance(table, (PolesZeros, Response)):
-        return table
-    return PolesZeros(**dict(PolesZerosTable.model_validate(table)))
-
-
-def _table_of_response(response: PolesZeros | Response | None) -> object:
-    """Return the table; none of a whole response, which is kept with the samples.
-
-    Its hundreds of coefficients are nothing for people to read.
-    """
-    if not isinstance(response, PolesZeros):
-        return None
-    return PolesZerosTable.model_construct(**asdict(response)).model_dump(exclude_defaults=True)
-
-
 class ChannelTable(BenchTable):
     """The table of a channel, from which a `Channel` is made."""
 
@@ -122,42 +115,20 @@ class ChannelTable(BenchTable):
     """For people: ``up``, ``north``, ``azimuth 90°, dip 0°``."""
     response: Annotated[
         InstanceOf[PolesZeros] | InstanceOf[Response] | None,
-        BeforeValidator(_poles_zeros),
-        PlainSerializer(_table_of_response),
+        _made(PolesZeros, Response),
+        PlainSerializer(_table_of),
     ] = None
     tolerance: Annotated[PositiveNumber, Field(lt=1.0)] | None = None
     """Of the sensitivity, as a fraction of it: that of the data sheet, where there is no
     certificate."""
     certificate: Annotated[
-        InstanceOf[Certificate] | None,
-        BeforeValidator(_certificate),
-        PlainSerializer(_table_of_certificate),
+        InstanceOf[Certificate] | None, _made(Certificate), PlainSerializer(_table_of)
     ] = None
     auxiliary: bool = False
     """Recorded and not estimated, such as a temperature."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _not_zero(cls, table: object) -> object:
-        if isinstance(table, Mapping) and table.get("sensitivity") == 0:
-            raise ValueError("sensitivity: expected counts per unit, not zero")
-        return table
 
-
-def _channel(table: object) -> Channel:
-    if isinstance(table, Channel):
-        return table
-    return Channel(**dict(ChannelTable.model_validate(table)))
-
-
-def _table_of_channel(channel: Channel) -> dict[str, Any]:
-    values = {each.name: getattr(channel, each.name) for each in fields(channel)}
-    return ChannelTable.model_construct(**values).model_dump(exclude_defaults=True)
-
-
-CheckedChannel = Annotated[
-    InstanceOf[Channel], BeforeValidator(_channel), PlainSerializer(_table_of_channel)
-]
+CheckedChannel = Annotated[InstanceOf[Channel], _made(Channel), PlainSerializer(_table_of)]
 TABLES: dict[type, type[BenchTable]] = {
     Channel: ChannelTable,
     PolesZeros: PolesZerosTable,
