@@ -257,28 +257,17 @@ class Response:
 
     def to_json(self) -> str:
         """Return text from which `response_from_json` makes an equal response."""
-        stages = []
-        for stage in self.stages:
-            table = asdict(stage)
-            for key in _COMPLEX:
-                if key in table:
-                    table[key] = [[value.real, value.imag] for value in table[key]]
-            stages.append({"kind": stage.kind} | table)
-        return json.dumps({"frequency": self.frequency, "stages": stages})
+        stages = [{"kind": stage.kind} | asdict(stage) for stage in self.stages]
+        return _text({"frequency": self.frequency, "stages": stages})
 
 
 def response_to_json(response: PolesZeros | Response) -> str:
     """Return a response as a recording holds it."""
-    if isinstance(response, Response):
-        return response.to_json()
-    return json.dumps(
-        {
-            "zeros": [[z.real, z.imag] for z in response.zeros],
-            "poles": [[p.real, p.imag] for p in response.poles],
-            "normalization": response.normalization,
-            "frequency": response.frequency,
-        }
-    )
+    return response.to_json() if isinstance(response, Response) else _text(asdict(response))
+
+
+def _text(table: dict[str, Any]) -> str:
+    return json.dumps(table, default=lambda z: [z.real, z.imag])
 
 
 def response_from_json(text: str) -> PolesZeros | Response:
