@@ -27,20 +27,16 @@ class HostClock(Protocol):
     @property
     def speed(self) -> float:
         """Host seconds that pass in one second of the system's monotonic clock."""
-        ...
 
     @property
     def suspended(self) -> float:
         """Return the total time for which the computer was suspended, in s; part of host time."""
-        ...
 
     def now(self) -> HostTime:
         """Return the present instant."""
-        ...
 
     def utc_ns(self) -> int:
         """Return UTC in ns since 1970 as its source has it, which may be set during a run."""
-        ...
 
 
 class SystemClock:

@@ -22,16 +22,13 @@ class DriverRules(Protocol):
     @property
     def settings(self) -> type[BaseModel]:
         """Model of the sensor's ``settings`` table in the bench file."""
-        ...
 
     @property
     def shares_clock(self) -> bool:
         """Whether all sensors on one port are sampled by one clock."""
-        ...
 
     def counts_dtype(self, sensor: Sensor) -> np.dtype[np.generic]:
         """Type of the raw counts in the blocks of a sensor."""
-        ...
 
     def check(self, sensors: Sequence[Sensor]) -> object:
         """Refuse settings that no such device accepts; ``sensors`` are all those of one port.
@@ -41,8 +38,6 @@ class DriverRules(Protocol):
         BenchFileError
             Naming the sensor, its key, the value and what was expected.
         """
-        ...
 
     def full_scale(self, sensor: Sensor) -> float | None:
         """Return the largest count of the sensor's channels, before the port is opened, or None."""
-        ...

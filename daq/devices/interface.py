@@ -226,4 +226,3 @@ class Listing(Protocol):
         NotConnectedError
             If the library is not installed.
         """
-        ...

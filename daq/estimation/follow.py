@@ -78,22 +78,18 @@ class Observer(Protocol):
 
     def status(self, status: RecordingStatus) -> None:
         """Take the state of the sensors: often, and cheap."""
-        ...
 
     def snapshot(self, snapshot: Snapshot, settings: Settings) -> None:
         """Take the estimate after new segments, and the result of a closed recording."""
-        ...
 
     def segments(self, n_segments: int, elapsed: float) -> None:
         """Take how many segments count so far, and the seconds they span, after each new one."""
-        ...
 
     def progress(self, done: int, total: int) -> None:
         """Take how many segments are done, and of how many.
 
         Of the result, or of what had been recorded before where the recording still grows.
         """
-        ...
 
 
 class WritingProcess(Protocol):
@@ -102,11 +98,9 @@ class WritingProcess(Protocol):
     @property
     def ended(self) -> bool:
         """Whether the process has ended."""
-        ...
 
     def ends_within(self, timeout: float) -> bool:
         """Wait this long (s), or until the process has ended; return whether it has."""
-        ...
 
 
 class _CancelledError(Exception):

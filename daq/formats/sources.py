@@ -13,7 +13,7 @@ from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import SAME_RATE, Overlap, assembled
@@ -33,31 +33,7 @@ _N_FIELDS = 7
 _NS_PER_S = 1_000_000_000
 
 
-class WantedCodes(Protocol):
-    """Which files are wanted; patterns of codes, and UTC in ns."""
-
-    @property
-    def networks(self) -> str:
-        """Pattern of network codes."""
-
-    @property
-    def stations(self) -> str:
-        """Pattern of station codes."""
-
-    @property
-    def locations(self) -> str:
-        """Pattern of location codes."""
-
-    @property
-    def start_ns(self) -> int | None:
-        """UTC of the start, if there is one."""
-
-    @property
-    def end_ns(self) -> int | None:
-        """UTC of the end, if there is one."""
-
-
-def sds_files(url: str, codes: WantedCodes) -> Iterator[Path]:
+def sds_files(url: str, codes: Selection) -> Iterator[Path]:
     """Yield the waveform files of an archive by channel and day.
 
     Raises
@@ -68,7 +44,7 @@ def sds_files(url: str, codes: WantedCodes) -> Iterator[Path]:
     yield from (path for *_, path in sds_days(url, codes))
 
 
-def sds_days(url: str, codes: WantedCodes) -> list[tuple[str, datetime, Path]]:
+def sds_days(url: str, codes: Selection) -> list[tuple[str, datetime, Path]]:
     """Return channel, as ``NET.STA.LOC.CHA``, day and file of an archive, by channel and day.
 
     The files of the day before `codes.start_ns` are among them: their last record may reach it.

@@ -56,22 +56,18 @@ class StreamRecord(Protocol):
     @property
     def stream_id(self) -> str:
         """ID of the stream."""
-        ...
 
     @property
     def start_ns(self) -> int:
         """UTC of the first sample, in ns since 1970."""
-        ...
 
     @property
     def sampling_rate(self) -> Fraction:
         """In Hz."""
-        ...
 
     @property
     def counts(self) -> NDArray[Any]:
         """Samples, shape (n_samples,)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -58,23 +58,18 @@ class Transport(Protocol):
 
     async def write(self, payload: bytes) -> None:
         """Send all bytes; raise OSError on failure."""
-        ...
 
     def expect(self, n_bytes: int) -> None:
         """Feed only when at least ``n_bytes`` are available."""
-        ...
 
     def pause(self) -> None:
         """Stop reading; the kernel buffers received bytes."""
-        ...
 
     def resume(self) -> None:
         """Continue reading."""
-        ...
 
     async def close(self) -> None:
         """Close the port."""
-        ...
 
 
 class StreamLog(Protocol):
@@ -82,19 +77,15 @@ class StreamLog(Protocol):
 
     def received(self, received: bytes, at: HostTime) -> None:
         """Note bytes that the driver read."""
-        ...
 
     def unread(self, received: bytes) -> None:
         """Note bytes that the driver discarded."""
-        ...
 
     def sent(self, payload: bytes) -> None:
         """Note bytes before they are sent."""
-        ...
 
     def lost(self, reason: str) -> None:
         """Note that the port closed by itself."""
-        ...
 
 
 HIGH_WATER = 4 * 1024 * 1024

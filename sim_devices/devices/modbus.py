@@ -8,7 +8,7 @@ writable, including WitMotion's unlock and rate registers.
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from pymodbus.constants import ExcCodes
@@ -35,26 +35,6 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 MAX_FRAME = 300
 
 
-class Slave(Protocol):
-    """One device on the bus."""
-
-    def is_off(self, now: float) -> bool:
-        """Return whether the slave is off and does not reply."""
-        ...
-
-    def read(self, function: int, address: int, count: int, now: float) -> Sequence[int] | ExcCodes:
-        """Return ``count`` registers, or an exception code."""
-        ...
-
-    def write(self, address: int, values: Sequence[int], now: float) -> ExcCodes | None:
-        """Set registers; return an exception code on failure."""
-        ...
-
-    def restart(self, now: float) -> None:
-        """Start anew: what was written is lost, and the counter begins at 0."""
-        ...
-
-
 class ModbusEndpoint(Endpoint):
     """Slaves on one line; an :class:`~sim_devices.devices.interface.Endpoint`.
 
@@ -62,7 +42,9 @@ class ModbusEndpoint(Endpoint):
     a gateway.
     """
 
-    def __init__(self, slaves: Mapping[int, Slave], framing: Literal["rtu", "tcp"]) -> None:
+    def __init__(
+        self, slaves: Mapping[int, RegisterDevice], framing: Literal["rtu", "tcp"]
+    ) -> None:
         self._slaves = slaves
         self._is_rtu = framing == "rtu"
         codec = DecodePDU(is_server=True)
@@ -162,7 +144,7 @@ AHEAD = 256
 
 
 class RegisterDevice:
-    """One slave; see :class:`sim_devices.devices.modbus.Slave`."""
+    """One device on the bus."""
 
     def __init__(self, sensor: str, settings: Mapping[str, Any], source: Source) -> None:
         self._sensor = sensor

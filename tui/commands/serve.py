@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Bench
     from daq.bench.tables.unattended import Web
-    from tui.service.clock import ServiceClock
+    from tui.service.clock import SystemTime
     from tui.service.records.run_state import Run
     from tui.service.service import Service
 
@@ -182,7 +182,7 @@ async def serve_runs(
     bench: Bench,
     wanted: Mapping[str, object],
     *,
-    clock: ServiceClock | None = None,
+    clock: SystemTime | None = None,
     anyway: bool = False,
 ) -> None:
     """Serve a bench until SIGINT or SIGTERM; SIGHUP reads its file again.

@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
-from typing import Protocol
 
 from daq.recorder.clock_trust import clock_state
 from daq.recorder.schedule import utc_now
@@ -22,25 +21,6 @@ from daq.recorder.schedule import utc_now
 _ABSOLUTE, _CANCEL_ON_SET = 1, 2
 _FAR = 2**31 - 1
 """Seconds since 1970 at which the timer would end, if the clock were never set."""
-
-
-class ServiceClock(Protocol):
-    """Tells the time, and lets it pass."""
-
-    def now(self) -> datetime:
-        """Return the time, in UTC."""
-
-    def elapsed(self) -> float:
-        """Return seconds of a clock that is never set, and goes on while the computer sleeps."""
-
-    async def sleep(self, seconds: float, wake: asyncio.Event) -> None:
-        """Let seconds pass, or fewer if the event is set."""
-
-    def is_synchronised(self) -> bool | None:
-        """Return whether something keeps the clock right; None if unknown."""
-
-    def watched(self, on_step: Callable[[], None]) -> contextlib.AbstractContextManager[None]:
-        """Call a function of the event loop whenever the clock was set, where the system can."""
 
 
 class SystemTime:

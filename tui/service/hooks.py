@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daq.bench.tables.unattended import Hooks
-    from tui.service.clock import ServiceClock
+    from tui.service.clock import SystemTime
 
 _SHORTEST_SECRET = 4
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -65,11 +65,11 @@ class HookRunner:
     store : RunStore
     folder : Path
         Of the recordings.
-    clock : ServiceClock
+    clock : SystemTime
     """
 
     def __init__(
-        self, hooks: Callable[[], Hooks], store: RunStore, folder: Path, clock: ServiceClock
+        self, hooks: Callable[[], Hooks], store: RunStore, folder: Path, clock: SystemTime
     ) -> None:
         self._hooks, self._store, self._folder, self._clock = hooks, store, folder, clock
         self._queue: asyncio.Queue[Run] = asyncio.Queue()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from daq.bench.model import Bench
-    from tui.service.clock import ServiceClock
+    from tui.service.clock import SystemTime
     from tui.service.processes.steps import Steps
 
 _LOGGER = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class Service:
     steps : callable
         Makes the `Steps` of a bench.
     store : RunStore
-    clock : ServiceClock
+    clock : SystemTime
     options : mapping
         Settings of the estimate that replace those of the bench file, as its table has them.
     reload : callable
@@ -85,7 +85,7 @@ class Service:
         *,
         steps: Callable[[Bench], Steps],
         store: RunStore,
-        clock: ServiceClock,
+        clock: SystemTime,
         options: Mapping[str, Any],
         reload: Callable[[], Bench],
         on_change: Callable[[Run], None] = lambda _: None,

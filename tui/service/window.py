@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tui.service.clock import ServiceClock
+    from tui.service.clock import SystemTime
     from tui.service.processes.steps import Recorder, Steps
 
 _LOGGER = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class Window:
     Parameters
     ----------
     steps : Steps
-    clock : ServiceClock
+    clock : SystemTime
     stop : asyncio.Event
         Set when the service is to end.
     save : callable
@@ -74,7 +74,7 @@ class Window:
         self,
         *,
         steps: Steps,
-        clock: ServiceClock,
+        clock: SystemTime,
         stop: asyncio.Event,
         save: Callable[[Run], None],
         folder: Path,

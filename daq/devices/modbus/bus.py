@@ -121,11 +121,9 @@ class _Link(Protocol):
         self, request: _Request, patience: float, *, late: Mapping[int, Collection[int]]
     ) -> _Answer:
         """Return the reply; ``late``: see :class:`ReplyFinder`."""
-        ...
 
     async def settle(self, seconds: float) -> None:
         """Wait for a late reply and discard it."""
-        ...
 
 
 class _RtuLink:
