@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import base64
+import io
 import math
-import struct
 import threading
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from urllib.parse import urlencode
 
 import numpy as np
 from markupsafe import Markup
+from PIL import Image
 from starlette.datastructures import QueryParams
 
 from daq.estimation.settings import Settings
@@ -273,11 +273,6 @@ def png(share: FloatArray) -> bytes:
     colour = ramp[below] * (1 - part) + ramp[below + 1] * part
     alpha = np.where(np.isfinite(share), 255, 0)[..., None]
     pixels = np.concatenate([colour, alpha], axis=2).round().astype(np.uint8)
-    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (1, 0)))  # each begins with a filter
-    size = struct.pack(">IIBBBBB", share.shape[1], share.shape[0], 8, 6, 0, 0, 0)
-    chunks = ((b"IHDR", size), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(content)) + kind + content
-        + struct.pack(">I", zlib.crc32(kind + content))
-        for kind, content in chunks
-    )  # fmt: skip
+    picture = io.BytesIO()
+    Image.fromarray(pixels).save(picture, "png")
+    return picture.getvalue()

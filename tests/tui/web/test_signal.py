@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import struct
-import zlib
+from io import BytesIO
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from markupsafe import escape
+from PIL import Image
 
 from tests.tui.night_recording import HOSTILE
 from tests.tui.web.conftest import SIZES, opened
@@ -69,14 +69,11 @@ def test_a_spectrogram_is_a_picture_in_the_page(server: Server) -> None:
 
 
 def test_the_png_is_one() -> None:
-    """Its lines have as many pixels as it says; what is not known is transparent."""
+    """What is not known is transparent."""
     content = png(np.array([[0.0, 0.5, 1.0], [np.nan, 1.0, 0.0]]))
-    width, height = struct.unpack(">II", content[16:24])
-    assert (width, height) == (3, 2)
-    data = content[content.index(b"IDAT") + 4 : content.index(b"IEND") - 8]
-    rows = np.frombuffer(zlib.decompress(data), np.uint8).reshape(2, 13)
-    assert rows[:, 0].tolist() == [0, 0]
-    assert rows[:, 4::4].tolist() == [[255, 255, 255], [0, 255, 255]]
+    pixels = np.asarray(Image.open(BytesIO(content)))
+    assert pixels.shape == (2, 3, 4)
+    assert pixels[..., 3].tolist() == [[255, 255, 255], [0, 255, 255]]
 
 
 @pytest.mark.parametrize("size", SIZES)
