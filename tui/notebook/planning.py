@@ -239,11 +239,13 @@ class Axes:
     n_sensors: int
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class RecordingPlan(Mapping[str, MethodPlan]):
     """What every method needs, as `huddle.plan` returns it: a `MethodPlan` by name of the method.
 
     Attributes
     ----------
+    plans : mapping of str to MethodPlan
     snr, cov, lowest : float
         `lowest` is the lowest frequency of the band of interest, in Hz.
     settings : WelchSettings
@@ -255,30 +257,23 @@ class RecordingPlan(Mapping[str, MethodPlan]):
         What axes that are off leave in doubt; None where the sensors determine all dimensions.
     """
 
-    def __init__(
-        self,
-        plans: Mapping[str, MethodPlan],
-        *,
-        snr: float,
-        cov: float,
-        lowest: float,
-        settings: WelchSettings,
-        waves: Waves | None = None,
-        leakage: Leakage | None = None,
-        axes: Axes | None = None,
-    ) -> None:
-        self.snr, self.cov, self.lowest, self.settings = snr, cov, lowest, settings
-        self.waves, self.leakage, self.axes = waves, leakage, axes
-        self._plans = dict(plans)
+    plans: Mapping[str, MethodPlan]
+    snr: float
+    cov: float
+    lowest: float
+    settings: WelchSettings
+    waves: Waves | None = None
+    leakage: Leakage | None = None
+    axes: Axes | None = None
 
     def __getitem__(self, method: str) -> MethodPlan:
-        return self._plans[method]
+        return self.plans[method]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._plans)
+        return iter(self.plans)
 
     def __len__(self) -> int:
-        return len(self._plans)
+        return len(self.plans)
 
     def __repr__(self) -> str:
         return rendered([self.title, self.table(), *self.remarks])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
@@ -47,6 +47,7 @@ class _End(Enum):
     WITH_SERVICE = auto()
 
 
+@dataclass(kw_only=True, eq=False)
 class Window:
     """Records one run.
 
@@ -70,27 +71,20 @@ class Window:
         Whether another run has just been recorded with these sensors: no check list is made.
     """
 
-    def __init__(
-        self,
-        *,
-        steps: Steps,
-        clock: SystemTime,
-        stop: asyncio.Event,
-        save: Callable[[Run], None],
-        folder: Path,
-        min_free: int,
-        shortest: float,
-        ahead: asyncio.Task[str] | None = None,
-        is_fresh: bool = False,
-    ) -> None:
-        self._steps, self._clock, self._stop, self._save = steps, clock, stop, save
-        self._folder, self._min_free, self._shortest = folder, min_free, shortest
-        self._ahead, self._is_fresh = ahead, is_fresh
-        self.status: dict[str, Any] | None = None
-        """Latest status that the recorder reported of itself and its sensors; None before."""
-        self._ends_at = 0.0
-        self.progressed_at: float | None = None
-        """Time of the event loop at which the recorder last made progress; None before."""
+    steps: Steps
+    clock: SystemTime
+    stop: asyncio.Event
+    save: Callable[[Run], None]
+    folder: Path
+    min_free: int
+    shortest: float
+    ahead: asyncio.Task[str] | None = None
+    is_fresh: bool = False
+    status: dict[str, Any] | None = field(default=None, init=False)
+    """Latest status that the recorder reported of itself and its sensors; None before."""
+    progressed_at: float | None = field(default=None, init=False)
+    """Time of the event loop at which the recorder last made progress; None before."""
+    _ends_at: float = field(default=0.0, init=False)
 
     async def record(self, run: Run) -> Run:
         """Record what is left of the window of a run in the state `RECORDING`.
@@ -100,24 +94,24 @@ class Window:
         Run
             In the state `ESTIMATING` or `FAILED`; in `RECORDING` where the service is to end.
         """
-        self._ends_at = self._clock.elapsed() + min(self._planned_rest(run), run.duration)
+        self._ends_at = self.clock.elapsed() + min(self._planned_rest(run), run.duration)
         recorder = self._left_over(run)
         if recorder is None and run.parts:
             if self._is_complete(run):
                 return self._recorded(run)
             run = run.because(STOPPED if STOPPED in run.reason else INTERRUPTED)
-        wait, begun = RETRY, self._clock.elapsed()
+        wait, begun = RETRY, self.clock.elapsed()
         while True:
             if recorder is None:
-                if self._stop.is_set():
+                if self.stop.is_set():
                     return run
-                if self._rest() < (self._shortest if run.parts else 0.0):
+                if self._rest() < (self.shortest if run.parts else 0.0):
                     break
                 if not run.parts and (wrong := await self._wrong()):
                     _LOGGER.warning("the check list fails: %s", wrong)
                     run = run.because(f"the check list fails: {wrong}")
-                    self._save(run)
-                    if self._clock.elapsed() - begun > START.total_seconds():
+                    self.save(run)
+                    if self.clock.elapsed() - begun > START.total_seconds():
                         break
                     run = await self._pause(run, wait)
                     wait = min(2 * wait, MAX_RETRY)
@@ -128,16 +122,13 @@ class Window:
                 recorder = None
                 if end is _End.WITH_SERVICE:
                     run = run.because(STOPPED)
-                    self._save(run)
+                    self.save(run)
                     return run
                 if end is _End.COMPLETE:
                     break
                 run = run.because(text)
-                self._save(run)
-                if (
-                    not self._existing(run)
-                    and self._clock.elapsed() - begun > START.total_seconds()
-                ):
+                self.save(run)
+                if not self._existing(run) and self.clock.elapsed() - begun > START.total_seconds():
                     break  # the devices, the bench file or the disk let no recording begin
             run = await self._pause(run, wait)
             wait = min(2 * wait, MAX_RETRY)
@@ -145,10 +136,10 @@ class Window:
 
     async def _wrong(self) -> str:
         """Return what the check list finds, without a delay of a recording that is due."""
-        ahead, self._ahead = self._ahead, None
-        is_fresh, self._is_fresh = self._is_fresh, False
+        ahead, self.ahead = self.ahead, None
+        is_fresh, self.is_fresh = self.is_fresh, False
         if ahead is None:
-            return "" if is_fresh else await self._steps.check()
+            return "" if is_fresh else await self.steps.check()
         if ahead.done():
             return ahead.result()
         _LOGGER.warning("the check list was not ready when the run was due; it is recorded")
@@ -157,42 +148,42 @@ class Window:
         return ""
 
     def _left_over(self, run: Run) -> Recorder | None:
-        return self._steps.running(run.parts[-1]) if run.parts else None
+        return self.steps.running(run.parts[-1]) if run.parts else None
 
     def _rest(self) -> float:
         """Return the seconds that are left, however the clock of the computer is set."""
-        return self._ends_at - self._clock.elapsed()
+        return self._ends_at - self.clock.elapsed()
 
     def _planned_rest(self, run: Run) -> float:
         end = run.window_end
-        return 0.0 if end is None else (end - self._clock.now()).total_seconds()
+        return 0.0 if end is None else (end - self.clock.now()).total_seconds()
 
     def _started(self, run: Run) -> tuple[Run, Recorder | None]:
         """Start a recorder; its part is in the database before."""
         try:
-            part = self._steps.new_part(self._clock.now())
+            part = self.steps.new_part(self.clock.now())
             run = replace(run, parts=(*run.parts, part))
-            self._save(run)
-            return run, self._steps.start(part, max(1.0, self._rest()), run.until)
+            self.save(run)
+            return run, self.steps.start(part, max(1.0, self._rest()), run.until)
         except (HuddleError, OSError) as error:
             return run.because(f"no recorder: {error}"), None
 
     async def _followed(self, recorder: Recorder) -> tuple[_End, str]:
         """Wait for the end of a recorder; end it where it must."""
         stalled = ""
-        known, since = None, self._clock.elapsed()
+        known, since = None, self.clock.elapsed()
         while not await recorder.ends_within(LOOK_INTERVAL):
-            if self._stop.is_set():
+            if self.stop.is_set():
                 await recorder.stop()
                 return _End.WITH_SERVICE, ""
-            if (free := free_space(self._folder)) is not None and free < self._min_free:
+            if (free := free_space(self.folder)) is not None and free < self.min_free:
                 await recorder.stop()
                 return _End.EARLY, f"recording closed at {_size(free)} of free space"
             self.status = await recorder.status()
             if self.status is not None and self.status["elapsed"] != known:
-                known, since = self.status["elapsed"], self._clock.elapsed()
+                known, since = self.status["elapsed"], self.clock.elapsed()
                 self.progressed_at = asyncio.get_running_loop().time()
-            elif self._clock.elapsed() - since > STALL.total_seconds():
+            elif self.clock.elapsed() - since > STALL.total_seconds():
                 stalled = f"the recorder made no progress for {STALL.total_seconds():.0f} s"
                 _LOGGER.error("%s; it is killed", stalled)
                 recorder.kill()
@@ -204,34 +195,34 @@ class Window:
         """Wait before the rest is recorded, as long as the disk is full."""
         is_logged = False
         while True:
-            await self._clock.sleep(min(seconds, max(0.0, self._rest())), self._stop)
-            free = free_space(self._folder)
-            is_full = free is not None and free < self._min_free
-            if not is_full or self._stop.is_set() or self._rest() <= self._shortest:
+            await self.clock.sleep(min(seconds, max(0.0, self._rest())), self.stop)
+            free = free_space(self.folder)
+            is_full = free is not None and free < self.min_free
+            if not is_full or self.stop.is_set() or self._rest() <= self.shortest:
                 return run
             if not is_logged:
                 _LOGGER.warning("%s of free space; the recording waits for more", _size(free or 0))
                 is_logged = True
 
     def _existing(self, run: Run) -> tuple[str, ...]:
-        return tuple(part for part in run.parts if (self._folder / part).exists())
+        return tuple(part for part in run.parts if (self.folder / part).exists())
 
     def _recorded(self, run: Run) -> Run:
         parts = self._existing(run)
         for part in set(run.parts) - set(parts):
-            self._steps.release(part)
+            self.steps.release(part)
         run = replace(run, parts=parts)
         if parts:
             return run.to(RunState.ESTIMATING)
         run = run if run.reason else run.because("nothing was recorded")
-        return run.to(RunState.FAILED, ended=self._clock.now())
+        return run.to(RunState.FAILED, ended=self.clock.now())
 
     def _is_complete(self, run: Run) -> bool:
         """Whether a recording that ends by its estimate has done so, without the service."""
         if not run.until.is_estimated or STOPPED in run.reason:
             return False
         try:
-            last = with_continuations([self._folder / run.parts[-1]])[-1]
+            last = with_continuations([self.folder / run.parts[-1]])[-1]
             with Recording.open(last) as recording:
                 return recording.closed
         except (HuddleError, OSError):
