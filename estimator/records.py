@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError
 from functools import cache
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeAlias, TypeVar, dataclass_transform
 
 Seconds: TypeAlias = float
 Hertz: TypeAlias = float
@@ -25,6 +25,7 @@ UNITS = {"Seconds": "s", "Hertz": "hz", "Share": "share", "Decibels": "db", "Deg
 """Of fields with these types: what is behind their names in JSON."""
 NOT_IN_JSON: Mapping[str, None] = {"key": None}
 """Metadata of a field that JSON leaves out; "key" is the name of another."""
+_CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 _UNIT = re.compile(rf"\b({'|'.join(UNITS)})\b")
 
 _Record = TypeVar("_Record", bound="Record")
@@ -90,6 +91,22 @@ class Record:
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
             object.__setattr__(self, name, value)
+
+
+class Kind(Record):
+    """Base of records of which each subclass is a kind.
+
+    Attributes
+    ----------
+    name : str
+        Name of the kind in JSON: that of the class, in lower case with hyphens.
+    """
+
+    __slots__ = ()
+    name: ClassVar[str]
+
+    def __init_subclass__(cls) -> None:
+        cls.name = _CAPITAL.sub("-", cls.__name__).lower()
 
 
 if TYPE_CHECKING:

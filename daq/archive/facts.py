@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS
 from daq.results.facts.fact import Fact
@@ -25,7 +25,6 @@ _MOST_FILES = 8
 class RecordingsLeftOut(Fact):
     """An archive leaves out `recordings`, in which the clocks of `sensors` are not understood."""
 
-    name: ClassVar[str] = "recordings-left-out"
     recordings: tuple[str, ...]
 
     def _words(self) -> Words:
@@ -46,7 +45,6 @@ class RecordingsLeftOut(Fact):
 class SpectraUnreadable(Fact):
     """Files of an archive cannot be read, and are left out; a sentence for each."""
 
-    name: ClassVar[str] = "spectra-unreadable"
     files: tuple[str, ...]
 
     def _words(self) -> Words:
@@ -64,7 +62,6 @@ class ChangesUndecided(Fact):
         Days of the archive, and those with an estimate that a channel needs.
     """
 
-    name: ClassVar[str] = "changes-undecided"
     n_days: int
     needed: int
 
@@ -86,7 +83,6 @@ class AbsencesNotUsed(Fact):
         Segments that each of `channels` lacks and other channels have.
     """
 
-    name: ClassVar[str] = "absences-not-used"
     n_segments: tuple[int, ...]
 
     def _words(self) -> Words:
@@ -104,7 +100,6 @@ class AbsencesNotUsed(Fact):
 class StretchesLeftOut(Fact):
     """Stretches with less than half of their segments are not in the probability density."""
 
-    name: ClassVar[str] = "stretches-left-out"
     n_stretches: int
 
     def _words(self) -> Words:
@@ -119,7 +114,6 @@ class StretchesLeftOut(Fact):
 class NightsNotCompared(Fact):
     """No channel has `needed` days with working hours and nights, which are not compared."""
 
-    name: ClassVar[str] = "nights-not-compared"
     needed: int
 
     def _words(self) -> Words:

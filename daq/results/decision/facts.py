@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
 
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import CAUSES
@@ -69,7 +68,6 @@ class WrongSensitivity(Fact):
         What is likely to be wrong.
     """
 
-    name: ClassVar[str] = "wrong-sensitivity"
     gains: tuple[float, ...]
     standard_errors: tuple[float, ...]
     against: tuple[str, ...]
@@ -99,7 +97,6 @@ class WrongSensitivity(Fact):
 class LimitUndecided(Fact):
     """Something keeps `channels` (empty: all) from a decision on `limits`, by their names."""
 
-    name: ClassVar[str] = "limit-undecided"
     obstacle: Obstacle
     limits: tuple[str, ...]
 
@@ -126,7 +123,6 @@ class LimitNotJudged(Fact):
         Lowest and highest frequency of the limit, and of its part that is judged, Hz.
     """
 
-    name: ClassVar[str] = "limit-not-judged"
     limit: str
     covers: tuple[Hertz, Hertz]
     judged: tuple[Hertz, Hertz]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 
@@ -47,7 +46,6 @@ class SteadyGainsAssumed(Fact):
         Relative change of a gain, for motion of ten times the power, that intervals allow for.
     """
 
-    name: ClassVar[str] = "steady-gains-assumed"
     share: float
 
     def _words(self) -> Words:
@@ -75,7 +73,6 @@ class NoisePartShared(Fact):
         Whether the pair was given; without, no other pair agrees with the parts.
     """
 
-    name: ClassVar[str] = "noise-part-shared"
     share: float
     share_error: float
     is_known: bool
@@ -106,7 +103,6 @@ class MethodsDiffer(Fact):
         Most by which the interval of `method` is extended to hold that of motion that changes, dB.
     """
 
-    name: ClassVar[str] = "methods-differ"
     difference: Decibels
 
     def _words(self) -> Words:
@@ -134,7 +130,6 @@ class NoiseNotIdentified(Fact):
         Channel along which the motion changes least; empty where it is not that.
     """
 
-    name: ClassVar[str] = "noise-not-identified"
     refusal: Refusal
     change: Decibels
     axis: str

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,7 +29,6 @@ class ChannelsClipped(Fact):
         Share of the samples of each channel.
     """
 
-    name: ClassVar[str] = "channels-clipped"
     shares: tuple[float, ...]
 
     def _words(self) -> Words:
@@ -55,7 +53,6 @@ class ChannelsWrap(Fact):
         The counts of each channel wrap at 2**bits.
     """
 
-    name: ClassVar[str] = "channels-wrap"
     bits: tuple[int, ...]
 
     def _words(self) -> Words:
@@ -85,7 +82,6 @@ class CodesMissing(Fact):
         Effective number of bits of the range of each channel's signal.
     """
 
-    name: ClassVar[str] = "codes-missing"
     steps: tuple[int, ...]
     n_missing: tuple[int, ...]
     stuck_bits: tuple[tuple[int, ...], ...]
@@ -121,7 +117,6 @@ class ReadingsRepeat(Fact):
         Hz: of new readings, and of the rows.
     """
 
-    name: ClassVar[str] = "readings-repeat"
     share: float
     refresh: Hertz
     polled: Hertz
@@ -148,7 +143,6 @@ class ChannelsStoodStill(Fact):
         How long, for each channel.
     """
 
-    name: ClassVar[str] = "channels-stood-still"
     constant: tuple[Seconds, ...]
 
     def _words(self) -> Words:
@@ -174,7 +168,6 @@ class RoundedAlike(Fact):
         Of the noise, largest of a channel and a third of an octave.
     """
 
-    name: ClassVar[str] = "rounded-alike"
     share: float
 
     def _words(self) -> Words:
@@ -201,7 +194,6 @@ class NotLinear(Fact):
     is_subtracted : bool
     """
 
-    name: ClassVar[str] = "not-linear"
     shares: tuple[float, ...]
     evidence: float
     is_subtracted: bool

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import ClassVar
 
 from daq.clocks.clock_model import ClockSetting, ClockSource
 from daq.estimation.snapshot import Snapshot
@@ -44,7 +43,6 @@ class ClocksFitted(Fact):
         Largest remaining error between them, s rms.
     """
 
-    name: ClassVar[str] = "clocks-fitted"
     ppm: tuple[float, ...]
     error: Seconds
 
@@ -70,7 +68,6 @@ class StatedTimesDrift(Fact):
         The sensor against which the motion shows it; empty if none.
     """
 
-    name: ClassVar[str] = "stated-times-drift"
     corrected: Mapping[str, Seconds]
     uncorrected: Mapping[str, Seconds]
     left: Seconds
@@ -102,8 +99,6 @@ class StatedTimesDrift(Fact):
 class StatedTimesUnchecked(Fact):
     """The UTC that sensors state could not be compared with the motion."""
 
-    name: ClassVar[str] = "stated-times-unchecked"
-
     def _words(self) -> Words:
         verb = "states" if len(self.sensors) == 1 else "state"
         text = f"The times that {listed(self.sensors)} {verb} could not be compared with the motion"
@@ -120,7 +115,6 @@ class StatedTimesUnchecked(Fact):
 class ClockSet(Fact):
     """The clock by which a sensor states times was set; its samples count on."""
 
-    name: ClassVar[str] = "clock-set"
     settings: tuple[ClockSetting, ...]
 
     def _words(self) -> Words:
@@ -141,7 +135,6 @@ class ClockSet(Fact):
 class SamplesUncounted(Fact):
     """A sensor lost or repeated samples without counting them; its count was corrected."""
 
-    name: ClassVar[str] = "samples-uncounted"
     slips: tuple[Uncounted, ...]
 
     def _words(self) -> Words:
@@ -175,7 +168,6 @@ class ClockNotUnderstood(Fact):
         s rms.
     """
 
-    name: ClassVar[str] = "clock-not-understood"
     ppm: float
     error: Seconds
 
@@ -206,8 +198,6 @@ class ClockNotUnderstood(Fact):
 class RatesNominal(Fact):
     """Samples are taken to be at their nominal rates; no interval includes that error."""
 
-    name: ClassVar[str] = "rates-nominal"
-
     def _words(self) -> Words:
         text = f"The samples of {listed(self.sensors)} are taken to be at their nominal rate"
         return Words(
@@ -222,7 +212,6 @@ class RatesNominal(Fact):
 class ClocksMayExplain(Fact):
     """Clocks are so little known that findings may come from them alone; `error` in s rms."""
 
-    name: ClassVar[str] = "clocks-may-explain"
     error: Seconds
 
     def _words(self) -> Words:

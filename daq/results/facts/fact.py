@@ -7,10 +7,9 @@ with the units that their types name.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Record, record
+from estimator.records import Kind, record
 from estimator.wording import Words
 
 MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
@@ -19,13 +18,11 @@ OUTSIDE = "Outside your band: "
 
 
 @record
-class Fact(Record):
+class Fact(Kind):
     """A fact about a test.
 
     Attributes
     ----------
-    name : str
-        Name of the kind, in JSON.
     rank : Rank
     sensors, channels : tuple of str
         Those concerned, channels as in ``A.X``; both empty for all.
@@ -39,7 +36,6 @@ class Fact(Record):
         Whether all that it concerns is outside of the band asked for.
     """
 
-    name: ClassVar[str]
     rank: Rank
     sensors: tuple[str, ...] = ()
     channels: tuple[str, ...] = ()
@@ -87,7 +83,6 @@ class Finding(Fact):
         What these are called.
     """
 
-    name: ClassVar[str] = "finding"
     findings: tuple[Advice, ...]
     names: Names
 

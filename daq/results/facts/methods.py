@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 
@@ -59,7 +58,6 @@ class MethodRefused(Fact):
         A sentence of the estimator's error.
     """
 
-    name: ClassVar[str] = "method-refused"
     reason: str
 
     def _words(self) -> Words:
@@ -77,7 +75,6 @@ class WithoutEstimate(Fact):
         Frequencies of the worst channel that are concerned, and all frequencies.
     """
 
-    name: ClassVar[str] = "without-estimate"
     flag: Flag
     most: int
     n_frequencies: int
@@ -96,8 +93,6 @@ class WithoutEstimate(Fact):
 class NoEstimateAbove(Fact):
     """There is no estimate in `band`, where resampling attenuates."""
 
-    name: ClassVar[str] = "no-estimate-above"
-
     def _words(self) -> Words:
         limit = math.nan if self.band is None else self.band[0]
         text = f"no estimate above {limit:.4g} Hz, where resampling attenuates"
@@ -108,7 +103,6 @@ class NoEstimateAbove(Fact):
 class SharedNoiseNotSearched(Fact):
     """Noise that two channels share is not searched for among so many channels."""
 
-    name: ClassVar[str] = "shared-noise-not-searched"
     n_channels: int
     most: int
 
@@ -128,7 +122,6 @@ class SteadinessNotTested(Fact):
     channels share are not tested either.
     """
 
-    name: ClassVar[str] = "steadiness-not-tested"
     causes: tuple[str, ...]
 
     def _words(self) -> Words:
@@ -142,8 +135,6 @@ class SteadinessNotTested(Fact):
 class LikeChannelsAssumed(Fact):
     """The two-channel method assumes parallel like channels with known gains."""
 
-    name: ClassVar[str] = "like-channels-assumed"
-
     def _words(self) -> Words:
         text = (
             f"{self.method}: assumes that like channels are parallel and have equal gains, or "
@@ -156,7 +147,6 @@ class LikeChannelsAssumed(Fact):
 class DirectionsPooled(Fact):
     """Directions of the motion come from neighbouring frequencies, at `n` of `n_frequencies`."""
 
-    name: ClassVar[str] = "directions-pooled"
     n: int
     n_frequencies: int
 
@@ -173,7 +163,6 @@ class DirectionsPooled(Fact):
 class ValuesBelowZero(Fact):
     """Values of the noise PSD are at or below zero, `n` of `n_values`."""
 
-    name: ClassVar[str] = "values-below-zero"
     n: int
     n_values: int
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
 
 import numpy as np
 
@@ -41,7 +40,6 @@ class FewSensors(Fact):
     n_sensors : int
     """
 
-    name: ClassVar[str] = "few-sensors"
     n_sensors: int
 
     def _words(self) -> Words:
@@ -64,7 +62,6 @@ class ModelUntested(Fact):
     dims : tuple of int
     """
 
-    name: ClassVar[str] = "model-untested"
     why: Untested
     n_effective: float
     n_channels: int
@@ -84,7 +81,6 @@ class ModelUntested(Fact):
 class ModelPasses(Fact):
     """The model test passes in all bands."""
 
-    name: ClassVar[str] = "model-passes"
     n_factors: int
     dims: tuple[int, ...]
 
@@ -111,7 +107,6 @@ class DimensionsChosen(Fact):
         Whether bands with the usual dimension remain.
     """
 
-    name: ClassVar[str] = "dimensions-chosen"
     choices: tuple[BandDimension, ...]
     usual: int
     elsewhere: bool
@@ -137,7 +132,6 @@ class DimensionsChosen(Fact):
 class DimensionsUnexplained(Fact):
     """No dimension that the sensors allow explains the averages in `bands` (Hz)."""
 
-    name: ClassVar[str] = "dimensions-unexplained"
     bands: tuple[tuple[Hertz, Hertz], ...]
 
     def _words(self) -> Words:
@@ -152,7 +146,6 @@ class DimensionsUnexplained(Fact):
 class DimensionsUndetermined(Fact):
     """More dimensions explain the averages in `bands` (Hz), but are not told from noise."""
 
-    name: ClassVar[str] = "dimensions-undetermined"
     bands: tuple[tuple[Hertz, Hertz], ...]
     usual: int
     n_sensors: int
@@ -181,7 +174,6 @@ class SharedByTwo(Fact):
         Largest part of the noise of a channel that is shared.
     """
 
-    name: ClassVar[str] = "shared-by-two"
     bands: tuple[tuple[Hertz, Hertz], ...]
     alternatives: tuple[tuple[str, str], ...]
     part: Share

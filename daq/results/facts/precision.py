@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import ClassVar
 
 import numpy as np
 
@@ -39,7 +38,6 @@ class PairCompared(Fact):
         Seconds; NaN where the motion does not tell.
     """
 
-    name: ClassVar[str] = "pair-compared"
     coherence: float
     coherence_error: float
     rotation: Degrees
@@ -76,7 +74,6 @@ class IntervalsWidened(Fact):
         Largest share of the noise; infinite without limit.
     """
 
-    name: ClassVar[str] = "intervals-widened"
     shares: Mapping[Source, float]
 
     def _words(self) -> Words:
@@ -100,7 +97,6 @@ class TargetMissed(Fact):
         Seconds of recording that reach the target.
     """
 
-    name: ClassVar[str] = "target-missed"
     cov: float
     target: float
     total: Seconds | None

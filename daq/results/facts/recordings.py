@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import ClassVar
 
 from daq.caveats import Caveat
 from daq.estimation.settings import Settings
@@ -29,8 +28,6 @@ DELAYING_SHARE = 0.1
 class SensorsSimulated(Fact):
     """A sensor was simulated: the noise is that of a model, not of instruments."""
 
-    name: ClassVar[str] = "sensors-simulated"
-
     def _words(self) -> Words:
         sentence = Caveat.SIMULATED.words.sentence
         return Words(sentence.rstrip("."), sentence)
@@ -51,7 +48,6 @@ class SensorLost(Fact):
         Whether it sent nothing at all.
     """
 
-    name: ClassVar[str] = "sensor-lost"
     missing: Seconds
     never_seen: bool
 
@@ -74,7 +70,6 @@ class SensorLost(Fact):
 class BlocksDamaged(Fact):
     """Blocks of a sensor in the file have wrong checksums, and are excluded as gaps."""
 
-    name: ClassVar[str] = "blocks-damaged"
     n_blocks: int
 
     def _words(self) -> Words:
@@ -90,7 +85,6 @@ class BlocksDamaged(Fact):
 class SamplesMissing(Fact):
     """A sensor has gaps."""
 
-    name: ClassVar[str] = "samples-missing"
     n_gaps: int
     n_samples: int
 
@@ -113,7 +107,6 @@ class SpanShortened(Fact):
     at_end : bool
     """
 
-    name: ClassVar[str] = "span-shortened"
     unused: Seconds
     at_end: bool
 
@@ -133,7 +126,6 @@ class SpanShortened(Fact):
 class NotInLiveEstimate(Fact):
     """A live estimate leaves out `sensors` to limit its memory; `n_all` are recorded."""
 
-    name: ClassVar[str] = "not-in-live-estimate"
     n_all: int
 
     def _words(self) -> Words:
@@ -157,7 +149,6 @@ class SensorOverdue(Fact):
         Whether the recording has ended.
     """
 
-    name: ClassVar[str] = "sensor-overdue"
     state: SensorState
     overdue: Seconds
     reason: str
@@ -176,7 +167,6 @@ class SensorOverdue(Fact):
 class ChannelsStuck(Fact):
     """Channels of a running test have a constant count, now or for some time earlier."""
 
-    name: ClassVar[str] = "channels-stuck"
     is_now: bool
 
     def _words(self) -> Words:
@@ -195,7 +185,6 @@ class ChannelsStuck(Fact):
 class SensorClipping(Fact):
     """A sensor of a running test reaches the end of its range; `are_kept`: segments with that."""
 
-    name: ClassVar[str] = "sensor-clipping"
     are_kept: bool
 
     def _words(self) -> Words:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import field
-from typing import ClassVar
 
 import numpy as np
 
@@ -32,7 +31,6 @@ class NoSegmentUsable(Fact):
         Longest stretch of the sensor without a gap, s.
     """
 
-    name: ClassVar[str] = "no-segment-usable"
     segment: Seconds
     reason: Reason
     longest: Seconds
@@ -80,7 +78,6 @@ class SegmentsExcluded(Fact):
         Where each octave has its own segments.
     """
 
-    name: ClassVar[str] = "segments-excluded"
     n_segments: int
     reasons: Mapping[Reason, int]
     transients_by_octave: tuple[DisturbedOctave, ...] = ()
@@ -117,7 +114,6 @@ class GapsBridged(Fact):
         Mean share of the noise that comes from other frequencies, in intervals already.
     """
 
-    name: ClassVar[str] = "gaps-bridged"
     n_segments: int
     lost: Share
     leakage: Share
@@ -148,7 +144,6 @@ class ChannelsAbsent(Fact):
         Methods that are estimated from the segments that all channels have.
     """
 
-    name: ClassVar[str] = "channels-absent"
     n_segments: tuple[int, ...]
     most: int
     complete_only: tuple[str, ...] = ()
@@ -188,7 +183,6 @@ class OctaveSegments(Fact):
     only_one : bool
     """
 
-    name: ClassVar[str] = "octave-segments"
     longest: Seconds
     n_effective: float
     below: Hertz
