@@ -93,8 +93,9 @@ class Record:
             object.__setattr__(self, name, value)
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True)
 class Kind(Record):
-    """Base of records of which each subclass is a kind.
+    """Base of records of which each subclass is a kind, and made by keywords only.
 
     Attributes
     ----------
@@ -102,11 +103,11 @@ class Kind(Record):
         Name of the kind in JSON: that of the class, in lower case with hyphens.
     """
 
-    __slots__ = ()
     name: ClassVar[str]
 
     def __init_subclass__(cls) -> None:
         cls.name = _CAPITAL.sub("-", cls.__name__).lower()
+        dataclasses.dataclass(kw_only=True, init=False, repr=False, eq=False)(cls)
 
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
-from estimator.records import record
 from estimator.wording import Words, listed, several
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ _MOST_FILES = 8
 """Recordings that a sentence names."""
 
 
-@record
 class RecordingsLeftOut(Fact):
     """An archive leaves out `recordings`, in which the clocks of `sensors` are not understood."""
 
@@ -41,7 +39,6 @@ class RecordingsLeftOut(Fact):
         )
 
 
-@record
 class SpectraUnreadable(Fact):
     """Files of an archive cannot be read, and are left out; a sentence for each."""
 
@@ -52,7 +49,6 @@ class SpectraUnreadable(Fact):
         return Words(f"{count} of the archive cannot be read", " ".join(self.files))
 
 
-@record
 class ChangesUndecided(Fact):
     """An archive has too few days for drift and changes.
 
@@ -73,7 +69,6 @@ class ChangesUndecided(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class AbsencesNotUsed(Fact):
     """Segments that some channels lack are not in the archive, for no channel.
 
@@ -96,7 +91,6 @@ class AbsencesNotUsed(Fact):
         )
 
 
-@record
 class StretchesLeftOut(Fact):
     """Stretches with less than half of their segments are not in the probability density."""
 
@@ -110,7 +104,6 @@ class StretchesLeftOut(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class NightsNotCompared(Fact):
     """No channel has `needed` days with working hours and nights, which are not compared."""
 

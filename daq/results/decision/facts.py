@@ -9,7 +9,7 @@ from daq.results.facts.fact import Fact
 from daq.results.vocabulary import CAUSES
 from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
-from estimator.records import Hertz, record
+from estimator.records import Hertz
 from estimator.wording import Words, few, listed
 
 _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
@@ -54,7 +54,6 @@ _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
 """What keeps a test from a decision, and what to do; sensitivities are facts of their own."""
 
 
-@record
 class WrongSensitivity(Fact):
     """Channels of a sensor read more or less of the common motion than the other sensors.
 
@@ -93,7 +92,6 @@ class WrongSensitivity(Fact):
         return Words(f"{text}: correct its sensitivity", f"{text}.", do)
 
 
-@record
 class LimitUndecided(Fact):
     """Something keeps `channels` (empty: all) from a decision on `limits`, by their names."""
 
@@ -111,7 +109,6 @@ class LimitUndecided(Fact):
         return Words(f"{line}{step}", f"{line[0].upper()}{line[1:]}.", do)
 
 
-@record
 class LimitNotJudged(Fact):
     """A limit goes beyond the spectrum, and is not judged there.
 

@@ -13,7 +13,7 @@ from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
-from estimator.records import Decibels, record
+from estimator.records import Decibels
 from estimator.self_noise.result import Flag, Refusal, SelfNoise
 from estimator.types import BoolArray
 from estimator.wording import Words, listed, span
@@ -34,7 +34,6 @@ _RECORD_CHANGES = (
 )
 
 
-@record
 class SteadyGainsAssumed(Fact):
     """Motion that changes tells noise from motion, if gains do not follow its loudness.
 
@@ -61,7 +60,6 @@ class SteadyGainsAssumed(Fact):
         )
 
 
-@record
 class NoisePartShared(Fact):
     """Motion that changes tells how much of their noise two `sensors` share in `band`.
 
@@ -93,7 +91,6 @@ class NoisePartShared(Fact):
         )
 
 
-@record
 class MethodsDiffer(Fact):
     """The noise of `channels` by `method` and by motion that changes differs beyond both intervals.
 
@@ -117,7 +114,6 @@ class MethodsDiffer(Fact):
         )
 
 
-@record
 class NoiseNotIdentified(Fact):
     """Motion that changes does not give the noise of `channels` in `band`: it is below a bound.
 

@@ -12,14 +12,13 @@ from daq.results.band_summary import known_range
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.levels.bands import third_octaves
-from estimator.records import Hertz, Seconds, record
+from estimator.records import Hertz, Seconds
 from estimator.wording import Words, few, listed, percent, several
 
 MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""
 
 
-@record
 class ChannelsClipped(Fact):
     """Samples are at the end of the range: the noise of these channels is too high.
 
@@ -43,7 +42,6 @@ class ChannelsClipped(Fact):
         )
 
 
-@record
 class ChannelsWrap(Fact):
     """Counts wrap: the noise of these channels is too high.
 
@@ -68,7 +66,6 @@ class ChannelsWrap(Fact):
         )
 
 
-@record
 class CodesMissing(Fact):
     """Codes of channels never occur: their resolution is less than their counts suggest.
 
@@ -105,7 +102,6 @@ class CodesMissing(Fact):
         )
 
 
-@record
 class ReadingsRepeat(Fact):
     """A device repeats its readings: the noise of its channels is too high.
 
@@ -133,7 +129,6 @@ class ReadingsRepeat(Fact):
         )
 
 
-@record
 class ChannelsStoodStill(Fact):
     """Channels had a constant count for a while.
 
@@ -158,7 +153,6 @@ class ChannelsStoodStill(Fact):
         )
 
 
-@record
 class RoundedAlike(Fact):
     """Channels of several sensors are rounded to counts alike, and share a part of that noise.
 
@@ -181,7 +175,6 @@ class RoundedAlike(Fact):
         )
 
 
-@record
 class NotLinear(Fact):
     """Channels of a sensor are not linear: squares and cubes of the motion add to their noise.
 

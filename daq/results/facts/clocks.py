@@ -15,7 +15,7 @@ from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.advice_on_signals import NoSharedMotion
-from estimator.records import Seconds, record
+from estimator.records import Seconds
 from estimator.wording import Words, few, listed, several, signed, time_of_day
 
 _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
@@ -31,7 +31,6 @@ _SURE = 3.0  # residuals of a clock, beyond which it drifts besides where it was
 _SETTINGS = 3  # named one by one
 
 
-@record
 class ClocksFitted(Fact):
     """The times of samples come from clocks fitted to their arrivals.
 
@@ -54,7 +53,6 @@ class ClocksFitted(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class StatedTimesDrift(Fact):
     """The UTC that sensors state drifts against the motion.
 
@@ -95,7 +93,6 @@ class StatedTimesDrift(Fact):
         return Words(line, text, f"Choose longer segments. {do}" if self.uncorrected else do)
 
 
-@record
 class StatedTimesUnchecked(Fact):
     """The UTC that sensors state could not be compared with the motion."""
 
@@ -111,7 +108,6 @@ class StatedTimesUnchecked(Fact):
         )
 
 
-@record
 class ClockSet(Fact):
     """The clock by which a sensor states times was set; its samples count on."""
 
@@ -131,7 +127,6 @@ class ClockSet(Fact):
         )
 
 
-@record
 class SamplesUncounted(Fact):
     """A sensor lost or repeated samples without counting them; its count was corrected."""
 
@@ -157,7 +152,6 @@ class SamplesUncounted(Fact):
         )
 
 
-@record
 class ClockNotUnderstood(Fact):
     """The delays measured from the motion do not lie on a sensor's clock.
 
@@ -194,7 +188,6 @@ class ClockNotUnderstood(Fact):
         )
 
 
-@record
 class RatesNominal(Fact):
     """Samples are taken to be at their nominal rates; no interval includes that error."""
 
@@ -208,7 +201,6 @@ class RatesNominal(Fact):
         )
 
 
-@record
 class ClocksMayExplain(Fact):
     """Clocks are so little known that findings may come from them alone; `error` in s rms."""
 

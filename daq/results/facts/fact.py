@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Kind, record
+from estimator.records import Kind
 from estimator.wording import Words
 
 MARKS: Mapping[Rank, str] = {Rank.INVALIDATES: "✗", Rank.DELAYS: "▲", Rank.TO_KNOW: "·"}
@@ -17,7 +17,6 @@ OUTSIDE = "Outside your band: "
 """Before a fact that does not concern the band asked for."""
 
 
-@record
 class Fact(Kind):
     """A fact about a test.
 
@@ -71,7 +70,6 @@ class Fact(Kind):
         return f"{OUTSIDE if self.is_outside else ''}{self.words}"
 
 
-@record
 class Finding(Fact):
     """Findings of one kind of the estimator, worst first.
 

@@ -16,7 +16,6 @@ from daq.results.vocabulary import FLAG_WORDS
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_signals import Copies, NoSharedMotion, NoSignal
 from estimator.checks.shared_noise import MAX_CHANNELS
-from estimator.records import record
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import Words, few, listed
@@ -48,7 +47,6 @@ ARCHIVES, TOO_LITTLE = "archives", "so few averages, or motion so weak"
 """Causes of `SteadinessNotTested`."""
 
 
-@record
 class MethodRefused(Fact):
     """A method gives no result.
 
@@ -64,7 +62,6 @@ class MethodRefused(Fact):
         return Words(f"{self.method}: {self.reason}", f"{self.method}: {self.reason}")
 
 
-@record
 class WithoutEstimate(Fact):
     """Frequencies of `channels` have no valid estimate by `method`.
 
@@ -89,7 +86,6 @@ class WithoutEstimate(Fact):
         return Words(f"{line}: {do}", f"{text}.", f"{do[0].upper()}{do[1:]}.")
 
 
-@record
 class NoEstimateAbove(Fact):
     """There is no estimate in `band`, where resampling attenuates."""
 
@@ -99,7 +95,6 @@ class NoEstimateAbove(Fact):
         return Words(text, f"{text[0].upper()}{text[1:]}.")
 
 
-@record
 class SharedNoiseNotSearched(Fact):
     """Noise that two channels share is not searched for among so many channels."""
 
@@ -114,7 +109,6 @@ class SharedNoiseNotSearched(Fact):
         return Words(text, f"{text[0].upper()}{text[1:]}.")
 
 
-@record
 class SteadinessNotTested(Fact):
     """Whether noise and responses change during the recording is not tested; `causes` are why.
 
@@ -131,7 +125,6 @@ class SteadinessNotTested(Fact):
         return Words(text, f"{text[0].upper()}{text[1:]}: the intervals hold for a steady bench.")
 
 
-@record
 class LikeChannelsAssumed(Fact):
     """The two-channel method assumes parallel like channels with known gains."""
 
@@ -143,7 +136,6 @@ class LikeChannelsAssumed(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class DirectionsPooled(Fact):
     """Directions of the motion come from neighbouring frequencies, at `n` of `n_frequencies`."""
 
@@ -159,7 +151,6 @@ class DirectionsPooled(Fact):
         return Words(text, f"{text}; its directions are taken from neighbouring frequencies there.")
 
 
-@record
 class ValuesBelowZero(Fact):
     """Values of the noise PSD are at or below zero, `n` of `n_values`."""
 

@@ -13,7 +13,7 @@ from estimator.checks.advice import Rank, Untested, model
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_signals import NoSharedMotion, NoSignal, TooFewSensors
 from estimator.likelihood.dimension import BandDimension
-from estimator.records import Hertz, Share, record
+from estimator.records import Hertz, Share
 from estimator.wording import Words, few, listed, percent, span
 
 _WHY_UNTESTED = {
@@ -31,7 +31,6 @@ _WHY_UNTESTED = {
 }
 
 
-@record
 class FewSensors(Fact):
     """One sensor alone, or none: no method tells its noise from motion.
 
@@ -50,7 +49,6 @@ class FewSensors(Fact):
         )
 
 
-@record
 class ModelUntested(Fact):
     """Whether one common motion explains the averages was not tested.
 
@@ -77,7 +75,6 @@ class ModelUntested(Fact):
         return Words(line, text, do)
 
 
-@record
 class ModelPasses(Fact):
     """The model test passes in all bands."""
 
@@ -93,7 +90,6 @@ class ModelPasses(Fact):
         )
 
 
-@record
 class DimensionsChosen(Fact):
     """The dimensions of the motion were chosen by band.
 
@@ -128,7 +124,6 @@ class DimensionsChosen(Fact):
         return Words(line, " ".join(lines))
 
 
-@record
 class DimensionsUnexplained(Fact):
     """No dimension that the sensors allow explains the averages in `bands` (Hz)."""
 
@@ -142,7 +137,6 @@ class DimensionsUnexplained(Fact):
         return Words(f"{head}: move them closer", text, do)
 
 
-@record
 class DimensionsUndetermined(Fact):
     """More dimensions explain the averages in `bands` (Hz), but are not told from noise."""
 
@@ -161,7 +155,6 @@ class DimensionsUndetermined(Fact):
         )
 
 
-@record
 class SharedByTwo(Fact):
     """Two of `sensors` share noise in `bands` (Hz), or a motion that no third sensor feels.
 

@@ -16,13 +16,12 @@ from estimator.checks.relative_response import pair_coherence
 from estimator.errors import BandError
 from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
-from estimator.records import Degrees, Seconds, record
+from estimator.records import Degrees, Seconds
 from estimator.wording import Words, listed, measured, percent, roughly, span
 
 _TWO = 2  # sensors
 
 
-@record
 class PairCompared(Fact):
     """The second of two sensors against the first, from the motion in `band`, with errors (1 σ).
 
@@ -64,7 +63,6 @@ class PairCompared(Fact):
         )
 
 
-@record
 class IntervalsWidened(Fact):
     """What intervals of the table include beside scatter.
 
@@ -86,7 +84,6 @@ class IntervalsWidened(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class TargetMissed(Fact):
     """The wanted precision is not reached.
 

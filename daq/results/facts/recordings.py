@@ -13,7 +13,7 @@ from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import STATE_ALERTS
 from estimator.checks.advice import Rank
-from estimator.records import Seconds, record
+from estimator.records import Seconds
 from estimator.wording import Words, clock_time, listed, several, time_of_day
 
 LEAST_SHARE = 0.01
@@ -24,7 +24,6 @@ DELAYING_SHARE = 0.1
 """Share of the time of the estimate from which a sensor that shortens it delays the result."""
 
 
-@record
 class SensorsSimulated(Fact):
     """A sensor was simulated: the noise is that of a model, not of instruments."""
 
@@ -36,7 +35,6 @@ class SensorsSimulated(Fact):
 _OF_CAVEATS: Mapping[Caveat, type[Fact]] = {Caveat.SIMULATED: SensorsSimulated}
 
 
-@record
 class SensorLost(Fact):
     """A sensor sent nothing from `time_utc_ns` on.
 
@@ -66,7 +64,6 @@ class SensorLost(Fact):
         )
 
 
-@record
 class BlocksDamaged(Fact):
     """Blocks of a sensor in the file have wrong checksums, and are excluded as gaps."""
 
@@ -81,7 +78,6 @@ class BlocksDamaged(Fact):
         return Words(f"{text}: huddle repair --check counts all", f"{text} (wrong checksum).", do)
 
 
-@record
 class SamplesMissing(Fact):
     """A sensor has gaps."""
 
@@ -96,7 +92,6 @@ class SamplesMissing(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class SpanShortened(Fact):
     """`sensors` begin late, or end early, and only the time of all sensors is estimated.
 
@@ -122,7 +117,6 @@ class SpanShortened(Fact):
         )
 
 
-@record
 class NotInLiveEstimate(Fact):
     """A live estimate leaves out `sensors` to limit its memory; `n_all` are recorded."""
 
@@ -134,7 +128,6 @@ class NotInLiveEstimate(Fact):
         return Words(text.rstrip("."), text, "The result has all; so has huddle estimate.")
 
 
-@record
 class SensorOverdue(Fact):
     """A sensor of a running test is late or lost; of a closed one, it was lost before the end.
 
@@ -163,7 +156,6 @@ class SensorOverdue(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class ChannelsStuck(Fact):
     """Channels of a running test have a constant count, now or for some time earlier."""
 
@@ -181,7 +173,6 @@ class ChannelsStuck(Fact):
         return Words(text, f"{text}.")
 
 
-@record
 class SensorClipping(Fact):
     """A sensor of a running test reaches the end of its range; `are_kept`: segments with that."""
 

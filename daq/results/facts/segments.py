@@ -12,12 +12,11 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from daq.results.vocabulary import REASONS
 from estimator.checks.advice import Rank
-from estimator.records import Hertz, Seconds, Share, dataclass, record
+from estimator.records import Hertz, Seconds, Share, dataclass
 from estimator.spectra.segment_rejection import Reason
 from estimator.wording import Words, listed, percent, several, span
 
 
-@record
 class NoSegmentUsable(Fact):
     """No segment can be used.
 
@@ -66,7 +65,6 @@ class DisturbedOctave:
     n_segments: int = field(metadata={"key": "segments"})
 
 
-@record
 class SegmentsExcluded(Fact):
     """Segments are excluded.
 
@@ -101,7 +99,6 @@ class SegmentsExcluded(Fact):
         return Words(text, f"{text[0].upper()}{text[1:]}.")
 
 
-@record
 class GapsBridged(Fact):
     """Segments with gaps are used, with windows that are zero in the gaps.
 
@@ -130,7 +127,6 @@ class GapsBridged(Fact):
         )
 
 
-@record
 class ChannelsAbsent(Fact):
     """Channels have no samples in some segments; the others are estimated from these without them.
 
@@ -168,7 +164,6 @@ class ChannelsAbsent(Fact):
         )
 
 
-@record
 class OctaveSegments(Fact):
     """Low octaves have longer segments; `only_one` where there are too few samples for them.
 
