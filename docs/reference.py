@@ -72,7 +72,7 @@ def troubleshooting() -> str:
     """Return each kind of fact with an example in words: what is seen, its effect, what to do."""
     names = Names(("A", "B", "C"), tuple(f"{s}.{c}" for s in "ABC" for c in "XYZ"), (3, 3, 3))
     examples = [
-        *(Finding(rank=advice.rank, findings=(advice,), names=names) for advice, _ in ADVICE),
+        *(Finding(rank=advice.rank, findings=(advice,), names=names) for advice in ADVICE),
         *(fact for fact in FACTS if not isinstance(fact, Finding)),
     ]
     parts = []
