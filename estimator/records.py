@@ -2,7 +2,7 @@
 
 ``dataclasses.dataclass(frozen=True)`` compiles six methods for every class, which takes half a
 millisecond of processor time. Two hundred classes are defined whenever the program starts, and most
-are made seldom. `dataclass` and `record` make the same of a class, with the methods of `Record` for
+are made seldom. `dataclass` and `Kind` make the same of a class, with the methods of `Record` for
 all. Instances take a few microseconds longer to make: hot loops have no use for them.
 """
 
@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeAlias, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeAlias, dataclass_transform
 
 Seconds: TypeAlias = float
 Hertz: TypeAlias = float
@@ -28,16 +28,8 @@ NOT_IN_JSON: Mapping[str, None] = {"key": None}
 _CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 _UNIT = re.compile(rf"\b({'|'.join(UNITS)})\b")
 
-_Record = TypeVar("_Record", bound="Record")
 _MADE = ("__init__", "__repr__", "__setattr__", "__delattr__", "__getstate__", "__setstate__")
 _COMPARED = ("__eq__", "__hash__")
-
-
-@dataclass_transform(kw_only_default=True, frozen_default=True)
-def record(kind: type[_Record]) -> type[_Record]:
-    """Make a subclass of `Record` a frozen dataclass with slots, made by keywords only."""
-    made = dataclasses.dataclass(slots=True, kw_only=True, init=False, repr=False, eq=False)
-    return made(kind)
 
 
 _fields: Callable[[type], tuple[Field[Any], ...]] = cache(dataclasses.fields)

@@ -11,7 +11,7 @@ import enum
 from collections.abc import Sequence
 from typing import ClassVar, Self
 
-from estimator.records import Record, dataclass, record
+from estimator.records import Kind, dataclass
 from estimator.wording import Words, listed, several, span
 
 
@@ -78,14 +78,11 @@ class Names:
         return "–".join(self.sensors[sensor] for sensor in advice.sensors)
 
 
-@record
-class Advice(Record):
+class Advice(Kind):
     """Advice on a test; each kind is a subclass.
 
     Attributes
     ----------
-    name : str
-        Name of the kind, in JSON.
     rank : Rank
     sensors : tuple of int
         The sensors concerned; empty for all.
@@ -93,7 +90,6 @@ class Advice(Record):
         Hz; None for all frequencies.
     """
 
-    name: ClassVar[str]
     of_one: ClassVar[bool] = False
     """Whether it is a fault of one sensor, which appears in each pair with it."""
     rank: Rank

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import Self
 
 from estimator.checks.advice import Advice, Names, Rank, model
 from estimator.likelihood.dimension import has_room
-from estimator.records import Hertz, Share, record
+from estimator.records import Hertz, Share
 from estimator.wording import Words, listed, percent, ratio, several, span
 
 _THREE = 3  # sensors
@@ -19,7 +19,6 @@ EFFECT_OF_FEW_DIMENSIONS = (
 )
 
 
-@record
 class TooFewDimensions(Advice):
     """A model of fewer dimensions than the sensors sense does not explain the averages.
 
@@ -35,7 +34,6 @@ class TooFewDimensions(Advice):
         Band with this ratio, Hz.
     """
 
-    name: ClassVar[str] = "too-few-dimensions"
     n_factors: int
     statistic: float
     worst_statistic: float
@@ -55,7 +53,6 @@ class TooFewDimensions(Advice):
         return _failing(found, worst, names, EFFECT_OF_FEW_DIMENSIONS)
 
 
-@record
 class ModelMisfit(Advice):
     """One common motion does not explain the averages.
 
@@ -82,7 +79,6 @@ class ModelMisfit(Advice):
         Whether `error` is so large that the estimate is wrong.
     """
 
-    name: ClassVar[str] = "model-misfit"
     n_factors: int
     statistic: float
     worst_statistic: float
@@ -112,7 +108,6 @@ class ModelMisfit(Advice):
         return _failing(found, worst, names, effect_of_misfit(worst, names))
 
 
-@record
 class MotionAcross(Advice):
     """Sensors compared by fewer than three channels do not measure motion across these.
 
@@ -128,7 +123,6 @@ class MotionAcross(Advice):
         Maximum noise added by an angle of 1° between planes or axes, as a fraction of the noise.
     """
 
-    name: ClassVar[str] = "motion-across"
     n_channels: int
     larger_sensors: tuple[int, ...]
     snr: float
@@ -158,7 +152,6 @@ class MotionAcross(Advice):
         )
 
 
-@record
 class MissingDimension(Advice):
     """Motion is found in fewer dimensions than the sensors sense; in the others it is weaker.
 
@@ -173,7 +166,6 @@ class MissingDimension(Advice):
         Largest condition number of the matrix between two sensors.
     """
 
-    name: ClassVar[str] = "missing-dimension"
     n_dimensions: float
     n_channels: int
     condition: float
@@ -195,7 +187,6 @@ class MissingDimension(Advice):
         )
 
 
-@record
 class NearlySingular(Advice):
     """The cross-spectral matrix between two sensors is nearly singular.
 
@@ -205,7 +196,6 @@ class NearlySingular(Advice):
         Its largest condition number.
     """
 
-    name: ClassVar[str] = "nearly-singular"
     condition: float
 
     def _words(self, names: Names) -> Words:
@@ -227,7 +217,6 @@ class NearlySingular(Advice):
         )
 
 
-@record
 class WeakMotion(Advice):
     """The motion is weaker than the noise in every channel.
 
@@ -237,7 +226,6 @@ class WeakMotion(Advice):
         Largest ratio of the motion's PSD to the noise's.
     """
 
-    name: ClassVar[str] = "weak-motion"
     snr: float
 
     def _words(self, names: Names) -> Words:

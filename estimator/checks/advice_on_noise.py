@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Seconds, Share, record
+from estimator.records import Seconds, Share
 from estimator.wording import Words, few, listed, percent, several, time_of_day
 
 LARGE_FALL = -0.8
 """Change of a gain, of its mean over the segments, below which its size is not known."""
 
 
-@record
 class SharedNoise(Advice):
     """Pairs of channels, of one sensor or of two, share noise.
 
@@ -35,7 +33,6 @@ class SharedNoise(Advice):
         The channel with the largest bias.
     """
 
-    name: ClassVar[str] = "shared-noise"
     channels: tuple[tuple[int, int], ...]
     coherencies: tuple[float, ...]
     standard_errors: tuple[float, ...]
@@ -76,7 +73,6 @@ class SharedNoise(Advice):
         )
 
 
-@record
 class DisturbedSegments(Advice):
     """Single segments differ from all others beyond their common motion.
 
@@ -91,7 +87,6 @@ class DisturbedSegments(Advice):
         The channel with the largest excess.
     """
 
-    name: ClassVar[str] = "disturbed-segments"
     n_disturbed: int
     n_segments: int
     times: tuple[Seconds, ...]
@@ -114,7 +109,6 @@ class DisturbedSegments(Advice):
         )
 
 
-@record
 class NoiseChanges(Advice):
     """The noise of a channel differs between parts of the recording.
 
@@ -130,7 +124,6 @@ class NoiseChanges(Advice):
         Correction of the model test and the tests of shared noise.
     """
 
-    name: ClassVar[str] = "noise-changes"
     channel: int
     deviation: Share
     expected: Share
@@ -156,7 +149,6 @@ class NoiseChanges(Advice):
         )
 
 
-@record
 class ResponseChanges(Advice):
     """The gain or the direction of a sensor changes during the recording, or its response.
 
@@ -180,7 +172,6 @@ class ResponseChanges(Advice):
         PSD, for the worst channel.
     """
 
-    name: ClassVar[str] = "response-changes"
     channel: int | None
     is_turn: bool
     size: Share

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, Self, TypeVar
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Seconds, record
+from estimator.records import Seconds
 from estimator.wording import Words, degrees, few, listed, percent, ratio, signed
 
 Pairwise = TypeVar("Pairwise", bound=Advice)
@@ -40,7 +40,6 @@ LEVEL_DEG = 0.1
 """A rotation may exceed its horizontal part by this, and is still called horizontal."""
 
 
-@record
 class SwappedChannels(Advice):
     """Two channels of the second of `sensors` are swapped.
 
@@ -50,7 +49,6 @@ class SwappedChannels(Advice):
         Channel of the second sensor, and the channel of the first that it follows.
     """
 
-    name: ClassVar[str] = "swapped-channels"
     of_one: ClassVar[bool] = True
     channels: tuple[tuple[int, int], ...]
 
@@ -71,7 +69,6 @@ class SwappedChannels(Advice):
         )
 
 
-@record
 class Rotated(Advice):
     """Two sensors have different orientations.
 
@@ -86,7 +83,6 @@ class Rotated(Advice):
         Standard error of both angles.
     """
 
-    name: ClassVar[str] = "rotated"
     angle_deg: float
     horizontal_deg: float
     error_deg: float
@@ -114,7 +110,6 @@ class Rotated(Advice):
         return f"Sensors are rotated against each other{text}: {EFFECT_OF_ROTATION}."
 
 
-@record
 class NotOrthogonal(Advice):
     """Channels of one of two sensors are not at right angles.
 
@@ -124,7 +119,6 @@ class NotOrthogonal(Advice):
         Largest deviation from a right angle.
     """
 
-    name: ClassVar[str] = "not-orthogonal"
     of_one: ClassVar[bool] = True
     deviation_deg: float
 
@@ -148,7 +142,6 @@ class NotOrthogonal(Advice):
         )
 
 
-@record
 class ReversedPolarity(Advice):
     """A channel has the opposite sign of its counterpart.
 
@@ -158,7 +151,6 @@ class ReversedPolarity(Advice):
         Channels of the second and of the first of `sensors`.
     """
 
-    name: ClassVar[str] = "reversed-polarity"
     of_one: ClassVar[bool] = True
     channel: int
     counterpart: int
@@ -176,7 +168,6 @@ class ReversedPolarity(Advice):
         return f"{pairs}: no bias in a {ANY_AXES} estimate, but a sensitivity has the wrong sign."
 
 
-@record
 class Gain(Advice):
     """A channel's gain differs from that of its counterpart.
 
@@ -188,7 +179,6 @@ class Gain(Advice):
         Gain of the channel over that of its counterpart.
     """
 
-    name: ClassVar[str] = "gain"
     of_one: ClassVar[bool] = True
     channel: int
     counterpart: int
@@ -223,7 +213,6 @@ class Gain(Advice):
         )
 
 
-@record
 class Delay(Advice):
     """One sensor lags another.
 
@@ -235,7 +224,6 @@ class Delay(Advice):
         The same, in samples.
     """
 
-    name: ClassVar[str] = "delay"
     of_one: ClassVar[bool] = True
     delay: Seconds
     delay_samples: float
@@ -261,7 +249,6 @@ class Delay(Advice):
         return f"Sensors lag each other ({pairs}): {EFFECT_OF_DELAY}."
 
 
-@record
 class UnequalResponses(Advice):
     """Responses of `sensors` differ from those of others: motion leaks at the edges of segments.
 
@@ -280,7 +267,6 @@ class UnequalResponses(Advice):
         Sensors with filters that did not lower the noise of other segments, and are not used.
     """
 
-    name: ClassVar[str] = "unequal-responses"
     channel: int
     share: float
     share_without: float

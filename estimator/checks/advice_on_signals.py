@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from estimator.checks.advice import Advice, Names
-from estimator.records import record
 from estimator.wording import Words, few, listed, percent
 
 
-@record
 class NoSignal(Advice):
     """Channels of one sensor have no power, or a constant count.
 
@@ -22,7 +18,6 @@ class NoSignal(Advice):
         Share of the frequencies at which the worst of them is dead.
     """
 
-    name: ClassVar[str] = "no-signal"
     channels: tuple[int, ...]
     whole_sensor: bool
     share_of_frequencies: float
@@ -44,7 +39,6 @@ class NoSignal(Advice):
         )
 
 
-@record
 class Copies(Advice):
     """Channels repeat others sample for sample.
 
@@ -56,7 +50,6 @@ class Copies(Advice):
         Share of the frequencies at which they are equal.
     """
 
-    name: ClassVar[str] = "copies"
     channels: tuple[tuple[int, int], ...]
     share_of_frequencies: float
 
@@ -73,7 +66,6 @@ class Copies(Advice):
         )
 
 
-@record
 class NoSharedMotion(Advice):
     """A sensor records none of the motion that others share.
 
@@ -89,7 +81,6 @@ class NoSharedMotion(Advice):
         Whether it shared the motion for another part of the test; `share` is then 0.
     """
 
-    name: ClassVar[str] = "no-shared-motion"
     partners: tuple[int, ...]
     share: float
     share_of_partners: float
@@ -126,11 +117,8 @@ class NoSharedMotion(Advice):
         )
 
 
-@record
 class TooFewSensors(Advice):
     """Fewer than three sensors, `sensors`, have a signal of their own."""
-
-    name: ClassVar[str] = "too-few-sensors"
 
     def _words(self, names: Names) -> Words:
         two = len(self.sensors) == 2
@@ -158,7 +146,6 @@ class TooFewSensors(Advice):
         )
 
 
-@record
 class MissingChannels(Advice):
     """Channels of `sensors` are missing, so that fewer than three sensors are complete.
 
@@ -168,7 +155,6 @@ class MissingChannels(Advice):
         The sensors with a signal of their own on every channel.
     """
 
-    name: ClassVar[str] = "missing-channels"
     whole_sensors: tuple[int, ...]
 
     def _words(self, names: Names) -> Words:

@@ -5,24 +5,24 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import FrozenInstanceError, dataclass, field, fields, is_dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 
 from estimator import records
-from estimator.records import Record, record
+from estimator.records import Kind
 
 
-@record
-class _Base(Record):
-    name: ClassVar[str] = "base"
+class ABase(Kind):
+    """A kind."""
+
     level: int
     sensors: tuple[int, ...] = ()
 
 
-@record
-class _Special(_Base):
-    name: ClassVar[str] = "special"
+class SpecialKind(ABase):
+    """A kind with more fields."""
+
     share: float
     whole: bool = False
 
@@ -36,22 +36,22 @@ class _Usual:
 
 
 def test_a_record_is_as_a_frozen_dataclass() -> None:
-    made, usual = _Special(level=1, share=0.5), _Usual(level=1, share=0.5)
+    made, usual = SpecialKind(level=1, share=0.5), _Usual(level=1, share=0.5)
     assert is_dataclass(made)
     assert [each.name for each in fields(made)] == [each.name for each in fields(usual)]
-    assert repr(made).removeprefix("_Special") == repr(usual).removeprefix("_Usual")
-    assert made == _Special(level=1, share=0.5, sensors=(), whole=False)
-    assert made != _Special(level=1, share=0.25)
-    assert made != _Base(level=1)
+    assert repr(made).removeprefix("SpecialKind") == repr(usual).removeprefix("_Usual")
+    assert made == SpecialKind(level=1, share=0.5, sensors=(), whole=False)
+    assert made != SpecialKind(level=1, share=0.25)
+    assert made != ABase(level=1)
     assert hash(made) == hash(usual)
-    assert replace(made, sensors=(2,)) == _Special(level=1, share=0.5, sensors=(2,))
+    assert replace(made, sensors=(2,)) == SpecialKind(level=1, share=0.5, sensors=(2,))
     assert copy.copy(made) == made
     assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 - made here
-    assert not hasattr(made, "__dict__")
+    assert (made.name, ABase.name) == ("special-kind", "a-base")
 
 
 def test_a_record_cannot_be_changed() -> None:
-    made = _Base(level=1)
+    made = ABase(level=1)
     with pytest.raises(FrozenInstanceError, match="cannot assign to field 'level'"):
         made.level = 2  # type: ignore[misc]  # what is tested
     with pytest.raises(FrozenInstanceError, match="cannot delete field 'level'"):
@@ -61,11 +61,11 @@ def test_a_record_cannot_be_changed() -> None:
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"level": 1}, "_Special without share"), ({"level": 1, "share": 2.0, "x": 3}, "has no x")],
+    [({"level": 1}, "SpecialKind without share"), ({"level": 1, "share": 2.0, "x": 3}, "has no x")],
 )
 def test_fields_are_complete_and_known(values: dict[str, float], message: str) -> None:
     with pytest.raises(TypeError, match=message):
-        _Special(**values)  # type: ignore[arg-type]  # what is tested
+        SpecialKind(**values)  # type: ignore[arg-type]  # what is tested
 
 
 @pytest.mark.parametrize("eq", [True, False])
