@@ -119,6 +119,9 @@ class SensorPreview:
         Its standard error, as a fraction of the rate.
     arrival_scatter : float
         Standard deviation of the arrival times about even ones, in s.
+    is_polled : bool
+        Whether each sample has an instant of its own, when it was asked for; `samples` are
+        interpolated at even ones.
     limits : CountLimits
         What the counts show of their limits.
     is_clipping : bool
@@ -139,6 +142,7 @@ class SensorPreview:
     measured_rate: float | None = None
     rate_error: float = 0.0
     arrival_scatter: float = 0.0
+    is_polled: bool = False
     limits: CountLimits = field(default_factory=CountLimits)
     is_clipping: bool = False
     n_missing: int = 0
@@ -161,6 +165,10 @@ class SensorPreview:
         raw = np.concatenate([block.counts for block in blocks])
         counts = raw.astype(np.float64)
         arrived = arrivals(blocks)
+        instants = [block.instants_ns for block in blocks if block.instants_ns is not None]
+        is_polled = len(instants) == len(blocks)
+        if is_polled:
+            counts = _even(np.concatenate(instants), counts, sensor.sampling_rate)
         main = [n for n, channel in enumerate(sensor.channels) if not channel.auxiliary]
         limits = CountLimits.of(raw, {n: np.ones(len(raw), bool) for n in main})
         return cls(
@@ -171,15 +179,25 @@ class SensorPreview:
             measured_rate=arrived.rate,
             rate_error=arrived.error,
             arrival_scatter=arrived.scatter,
+            is_polled=is_polled,
             limits=limits,
             is_clipping=bool(limits.clipped)
             or any(BlockFlag.CLIPPED in block.flags for block in blocks),
             is_counted=any(
                 each.device_counter is not None or each.instants_ns is not None for each in blocks
             ),
-            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(counts),
+            n_missing=blocks[-1].end_sample - blocks[0].first_sample - len(raw),
             trouble=trouble,
         )
+
+
+def _even(
+    instants_ns: NDArray[np.int64], counts: NDArray[np.float64], rate: float
+) -> NDArray[np.float64]:
+    """Return samples that were polled at uneven instants at even ones, which end with the last."""
+    times = (instants_ns - instants_ns[-1]) * 1e-9
+    even = np.arange(int(times[0] * rate), 1) / rate
+    return np.stack([np.interp(even, times, each) for each in counts.T], axis=1)
 
 
 class _SensorBuffer:

@@ -66,17 +66,17 @@ SENTENCES: Mapping[Problem, str] = {
     " (gravity) or 0: check sensitivity and unit",
     Problem.COMMON_HUM: "not certain, because all sensors have most of {channel} at {value:.0f} Hz:"
     " hum, or motion of machines ({sensor})",
-    Problem.NO_SERIAL_NUMBER: "not checked, because {sensor} states no serial number",
+    Problem.NO_SERIAL_NUMBER: "not checked, because there is no serial number of {sensor}",
     Problem.NOT_IN_FILE: "not checked, because the bench file has no serial number of {sensor}:"
     " huddle check --write adds it",
     Problem.NO_FULL_SCALE: "not checked, because the full scale of {sensor} is not known: give"
     " full_scale in the data_sheet of the bench file",
     Problem.UNCOUNTED: "rates as in the bench file; not checked whether samples are missing,"
-    " because {sensor} sends no counter and no times",
+    " because there is no counter and no time of {sensor}",
     Problem.UNEVEN: "not checked, because the samples of {sensor} arrive unevenly",
     Problem.LEFT_OUT: "the other checks leave out {sensor}{moot}",
-    Problem.TOO_FEW_SAMPLES: "not checked, because {sensor} has not sent enough samples",
-    Problem.TOO_SLOW: "not checked, because {sensor} is sampled too slowly",
+    Problem.TOO_FEW_SAMPLES: "not checked, because there are too few samples of {sensor}",
+    Problem.TOO_SLOW: "not checked, because of the low sampling rate of {sensor}",
     Problem.TOO_FEW_SENSORS: "not checked, because fewer than three sensors can be compared",
     Problem.NOT_COMPARABLE: "not checked, because the motion of {sensor} cannot be compared: it is"
     " too weak, or its channels are others",

@@ -19,6 +19,7 @@ from daq.protocols.block import Block, HostTime
 from estimator.checks.sensitivities import Cause
 from estimator.types import FloatArray
 from tests.tui.example_snapshot import demo_bench
+from tui.output.check_list import MERGED, lines
 
 RATE = 200.0
 BENCH = demo_bench()
@@ -165,6 +166,54 @@ def test_a_sensor_on_another_floor_is_found_however_late_its_samples_are(late: i
     assert findings([a, b, c]) == []
     other = np.random.default_rng(9).normal(size=c.samples.shape) * 1e-3
     assert (Problem.ALONE, "C", "") in failures([a, b, replace(c, samples=other)])
+
+
+@pytest.mark.parametrize("late", [-1.3, -0.12, 0.12, 1.3])
+@pytest.mark.parametrize("rate", [50.0, 128.0, 200.0])
+def test_devices_that_send_packets_late_or_have_another_rate_share_the_motion(
+    late: float, rate: float
+) -> None:
+    """A Güralp digitizer beside an accelerometer that sends each sample was said to be alone."""
+    rng = np.random.default_rng(5)
+    spectrum = rng.normal(size=(600, 3)) + 1j * rng.normal(size=(600, 3))
+    frequency = 0.02 + np.arange(600) / 25.0  # up to 24 Hz, over more than the recording
+    sensors = []
+    for each, own, shift in zip(previews(), (RATE, RATE, rate), (0.0, 0.0, late), strict=True):
+        times = shift - np.arange(round(10 * own))[::-1] / own
+        motion = np.real(np.exp(2j * np.pi * np.outer(times, frequency)) @ spectrum) * 1e-3
+        motion += 1e-3 * rng.normal(size=motion.shape)
+        sensor = each.sensor.model_copy(update={"sampling_rate": own})
+        sensors.append(replace(each, sensor=sensor, samples=motion, measured_rate=own))
+    found = findings(sensors)
+    assert [each.problem for each in found if each.problem is not Problem.TOO_SLOW] == []
+
+
+def test_polled_samples_are_put_at_even_instants() -> None:
+    times_ns = np.cumsum(np.random.default_rng(1).integers(2_000_000, 30_000_000, 400))
+    sensor = SENSORS[0]
+    blocks = [
+        Block(
+            sensor.name,
+            n,
+            np.full((1, len(sensor.channels)), at_ns * 1e-3),
+            HostTime(at_ns, 0),
+            instants_ns=np.array([at_ns]),
+        )
+        for n, at_ns in enumerate(times_ns.tolist())
+    ]
+    seen = SensorPreview.of(sensor, None, blocks)
+    steps = np.diff(seen.samples * sensor.channels[0].sensitivity, axis=0)
+    np.testing.assert_allclose(steps, 1e6 / sensor.sampling_rate, rtol=1e-6)
+    assert (seen.n_missing, seen.last_ns) == (0, times_ns[-1])
+
+
+def test_gains_of_samples_polled_unevenly_are_not_compared() -> None:
+    a, b, c = previews()
+    polled = replace(c, samples=1.3 * c.samples, is_polled=True, arrival_scatter=0.2 / RATE)
+    assert failures([a, b, polled]) == []
+    unknown = [each for each in findings([a, b, polled]) if each.problem is Problem.UNEVEN]
+    assert [each.sensor for each in unknown] == ["C", "C"]  # sensitivities, polarity
+    assert failures([a, b, replace(polled, arrival_scatter=0.0)]) != []
 
 
 def test_identities_are_compared_and_unknown_ones_are_no_success() -> None:
@@ -364,3 +413,11 @@ def test_counts_that_wrap_repeat_or_lack_codes_are_found() -> None:
     repeats = known[Problem.REPEATS, "B", ""]
     assert repeats.value == pytest.approx(80.0, rel=0.01)
     assert repeats.wanted == RATE
+
+
+@pytest.mark.parametrize("problem", sorted(MERGED))
+def test_what_is_not_checked_of_several_sensors_is_one_sentence(problem: Problem) -> None:
+    rows = [CheckRow(Check.RATES, CheckFinding(problem, name)) for name in "AB"]
+    (line,) = lines(rows)
+    assert "A and B" in line.plain
+    assert "because A and B" not in line.plain  # is, or are
