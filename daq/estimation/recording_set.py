@@ -85,6 +85,17 @@ def is_complete(recording: ReadableRecording, following: ReadableRecording | Non
     return recording.closed or continues == recording.run_id
 
 
+def left_open(recordings: Sequence[ReadableRecording]) -> tuple[str, ...]:
+    """Return the names of recordings whose recorder was killed."""
+    return tuple(
+        recording.path.name
+        for recording, following in zip(recordings, (*recordings[1:], None), strict=True)
+        if isinstance(recording, Recording)
+        and is_left(recording)
+        and not is_complete(recording, following)
+    )
+
+
 def _following(recording: ReadableRecording) -> Iterator[Recording]:
     """Open and yield the recordings that continue this one, in their order."""
     if not isinstance(recording, Recording):

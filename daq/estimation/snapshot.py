@@ -254,6 +254,8 @@ class Snapshot:
         Whether what is not linear is taken off their noise.
     bridged : Bridged or None
         None where no segment with gaps counts.
+    left_open : tuple of str
+        Names of recordings whose recorder was killed. Of a finished estimate.
     not_estimated : tuple of str
         Sensors that sent nothing, and those that a live estimate leaves out to limit its memory.
     across_axes : tuple of float
@@ -303,6 +305,7 @@ class Snapshot:
     nonlinear: tuple[NonlinearChannel, ...] = ()
     linearised: bool = False
     bridged: Bridged | None = None
+    left_open: tuple[str, ...] = ()
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0

@@ -55,7 +55,7 @@ from daq.estimation.noise_estimates import (
     rounded_alike,
     with_sets,
 )
-from daq.estimation.recording_set import is_complete
+from daq.estimation.recording_set import is_complete, left_open
 from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import Settings
@@ -340,6 +340,7 @@ class SnapshotBuilder:
             clocks=clock_states(passes),
             drift=last_aligned(passes).drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
+            left_open=left_open(recordings) if final else (),
             left_out=_left_out(passes, sum(each.n_segments for each in sets) - n_unused),
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=_octaves(bands, sets) if self._settings.octaves else (),

@@ -148,7 +148,8 @@ def facts_of_precision(estimate: Estimate) -> Iterator[Fact]:
             rank = Rank.TO_KNOW
             yield IntervalsWidened(rank=rank, method=method, shares=shares)
     settings = estimate.settings
-    if not estimate.snapshot.closed or (settings.target_cov or settings.target_cov_bin) is None:
+    has_ended = estimate.snapshot.closed or estimate.snapshot.left_open
+    if not has_ended or (settings.target_cov or settings.target_cov_bin) is None:
         return
     try:
         reached = estimate.precision()

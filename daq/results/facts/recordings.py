@@ -35,6 +35,16 @@ class SensorsSimulated(Fact):
 _OF_CAVEATS: Mapping[Caveat, type[Fact]] = {Caveat.SIMULATED: SensorsSimulated}
 
 
+class RecordingLeftOpen(Fact):
+    """The recorder of a recording was killed; what it had saved is estimated."""
+
+    file: str
+
+    def _words(self) -> Words:
+        text, do = f"The recorder of {self.file} was killed", "huddle repair closes the file."
+        return Words(f"{text}: huddle repair closes it", f"{text}. All saved samples count.", do)
+
+
 class SensorLost(Fact):
     """A sensor sent nothing from `time_utc_ns` on.
 
@@ -188,6 +198,8 @@ def facts_of_recordings(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield what the recordings are of, and what they lack."""
     for caveat in snapshot.caveats:
         yield _OF_CAVEATS[caveat](rank=Rank.TO_KNOW)
+    for file in snapshot.left_open:
+        yield RecordingLeftOpen(rank=Rank.DELAYS, file=file)
     for sensor in snapshot.sensors:
         if sensor.is_lost:
             yield _lost(snapshot, sensor)

@@ -184,8 +184,10 @@ def test_what_happened_is_in_order_and_in_short(reported: Reported) -> None:
 def test_a_recording_left_open_is_not_called_running(reported: Reported, tmp_path: Path) -> None:
     recording, copy = tmp_path / "live.h5", tmp_path / "killed.h5"
     record(recording, before_end=lambda: shutil.copyfile(recording, copy))
-    report = report_of(result_of(reported.settings, copy))
+    result = result_of(reported.settings, copy)
+    report = report_of(result)
     assert report.verdict.text.startswith("Of a recording whose recorder was killed (huddle repair")
+    assert {"recording-left-open", "target-missed"} <= {fact.name for fact in result.facts}
     assert hashlib.sha256(copy.read_bytes()).hexdigest() in texts_of(report)
 
 

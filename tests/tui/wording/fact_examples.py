@@ -68,6 +68,7 @@ from daq.results.facts.recordings import (
     BlocksDamaged,
     ChannelsStuck,
     NotInLiveEstimate,
+    RecordingLeftOpen,
     SamplesMissing,
     SensorClipping,
     SensorLost,
@@ -150,6 +151,7 @@ EXAMPLES: tuple[Fact, ...] = (
         n_frequencies=9,
     ),
     NoSegmentUsable(rank=Rank.INVALIDATES, sensors=A, segment=10.0, reason=Reason.GAP, longest=4.0),
+    RecordingLeftOpen(rank=Rank.DELAYS, file="night.h5"),
     NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=A, n_all=3),
     SensorLost(
         rank=Rank.DELAYS,
