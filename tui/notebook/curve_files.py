@@ -8,9 +8,11 @@ the file of metadata that CSV on the Web puts beside it.
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
+import os
 import shutil
 import struct
 import warnings
@@ -32,7 +34,6 @@ from tui.output.curves import CURVES
 from tui.output.extras import load
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable, Iterator
 
     import xarray as xr
@@ -309,8 +310,13 @@ def loaded(path: Path) -> xr.Dataset:
     load(engine)
     try:
         check(path)
-    except (RecordingError, ValueError, KeyError, TypeError) as error:
-        raise OSError(f"{path}: not written by huddle, or damaged: {error}") from error
+    except (RecordingError, OSError, ValueError, KeyError, TypeError) as error:
+        if not path.exists():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
+        text = (
+            f"{path}: no netCDF or Zarr of huddle (a recording: huddle.open), or damaged: {error}"
+        )
+        raise OSError(text) from error
     found: xr.Dataset = load("xarray").load_dataset(path, engine=engine, **options)
     return found
 

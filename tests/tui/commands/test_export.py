@@ -364,7 +364,7 @@ def test_zarr_from_elsewhere_is_checked_before_it_is_inflated(
     described = json.loads((out / ".zmetadata").read_text(encoding="utf-8"))
     forged(out, described["metadata"]["noise_psd/.zarray"])
     (out / ".zmetadata").write_text(json.dumps(described), encoding="utf-8")
-    with pytest.raises(OSError, match=r"a\.zarr: not written by huddle, or damaged: .*noise_psd"):
+    with pytest.raises(OSError, match=r"a\.zarr: no netCDF or Zarr of huddle .*noise_psd"):
         huddle.load(out)
 
 
@@ -391,6 +391,15 @@ def test_netcdf_from_elsewhere_is_checked_before_it_is_inflated(
         file["x"] = h5py.ExternalLink("other.nc", "/x")
     with pytest.raises(OSError, match="a link"):
         huddle.load(out)
+
+
+def test_load_says_what_reads_other_files(recording: Path, tmp_path: Path) -> None:
+    (other := tmp_path / "a.toml").write_text("")
+    for path in (recording, other):
+        with pytest.raises(OSError, match=rf"{path.name}: no netCDF.*recording: huddle\.open"):
+            huddle.load(path)
+    with pytest.raises(FileNotFoundError, match=r"No such file or directory: .*a\.nc"):
+        huddle.load(tmp_path / "a.nc")
 
 
 def test_mat_and_numpy(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
