@@ -308,7 +308,7 @@ def check_format(path: Path, file: h5py.File) -> None:
         what = "it has no attribute format" if found is None else f"its format is {found!r}"
         raise NotARecordingError(
             f"{path}: an HDF5 file but not a huddle recording: {what};"
-            f" expected {file_format.FORMAT!r}"
+            f" expected {file_format.FORMAT!r}; for arrays of other programs: huddle import --help"
         )
     version = file.attrs.get("format_version")
     if not isinstance(version, (int, np.integer)) or version < 1:

@@ -41,11 +41,12 @@ _LEVEN = 4 * 105
 _SAC_LOGICALS, _SAC_HEADER = range(_LEVEN, _LEVEN + 20, 4), 632
 _MINUS_ONE = b"\xff\xff\xff\xff"
 _OTHERS = {
-    b"PK\x03\x04": "a spreadsheet; save it as CSV, then: huddle import FILE.csv",
-    b"\xd0\xcf\x11\xe0": "a spreadsheet; save it as CSV, then: huddle import FILE.csv",
-    b"PAR1": "Parquet; write CSV with pandas (read_parquet, to_csv), then: huddle import FILE.csv",
-    b"\x89HDF": "an HDF5 file; huddle estimate takes recordings of huddle. Write arrays of other"
-    " programs with numpy.savez, then: huddle import FILE.npz",
+    b"PK\x03\x04": "a spreadsheet; save it as CSV, then: huddle import FILE.csv --out NEW.h5",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet; save it as CSV, then: huddle import FILE.csv --out NEW.h5",
+    b"PAR1": "Parquet; write CSV with pandas (read_parquet, to_csv), then: huddle import FILE.csv"
+    " --out NEW.h5",
+    b"\x89HDF": "an HDF5 file; write sampling_rate and the array of each sensor with numpy.savez,"
+    " then: huddle import FILE.npz --out NEW.h5; recordings of huddle: huddle estimate",
 }
 """Files that are not read, by their first bytes, and what can be done with them."""
 

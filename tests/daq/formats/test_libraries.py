@@ -118,8 +118,8 @@ def test_texts_of_data_centres_have_any_name(obspy: ModuleType, tmp_path: Path) 
     ("name", "content", "said"),
     [
         ("sheet.xlsx", b"PK\x03\x04...", r"a spreadsheet.*: huddle import sheet\.csv"),
-        ("a.parquet", b"PAR1...", r"to_csv\), then: huddle import a\.csv"),
-        ("b.h5", b"\x89HDF...", r"numpy\.savez, then: huddle import b\.npz"),
+        ("a.parquet", b"PAR1...", r"to_csv\), then: huddle import a\.csv --out"),
+        ("b.h5", b"\x89HDF...", r"numpy\.savez, then: huddle import b\.npz --out"),
         ("SACPZ.X", b"* INPUT UNIT: M\nZEROS 0\nPOLES 0\nCONSTANT 1\n", "give it with --response"),
     ],
 )
