@@ -25,6 +25,7 @@ from estimator.checks.advice import Advice, Rank
 from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
+from estimator.checks.sensitivities import TOLERANCE
 from estimator.checks.shared_motion import outsiders, shown_from
 from estimator.checks.shared_noise import SharedPairs
 from estimator.likelihood.goodness_of_fit import less, rejected_below
@@ -104,8 +105,10 @@ def orientation(
         )
     off = int(np.argmax(np.abs(response.gains - 1)))
     if _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
+        harmless = TOLERANCE if dims[response.first] == 3 else LARGE_ERROR  # axes may be askew
+        very = abs(np.log(response.gains[off])) > np.log1p(harmless)
         yield advice_on_sensors.Gain(
-            rank=Rank.TO_KNOW,
+            rank=Rank.DELAYS if very else Rank.TO_KNOW,
             sensors=pair,
             band=band,
             channel=own + off,

@@ -144,13 +144,17 @@ def test_rotated_sensors_are_found_with_their_angle() -> None:
     assert np.isnan(rotated[0].horizontal_deg)  # nobody said which channel is vertical
 
 
-def test_a_wrong_gain_is_found_with_its_channel() -> None:
-    found = of(averages(bench(np.eye(3), np.diag([1.0, 1.05, 1.0]), np.eye(3))))
+@pytest.mark.parametrize(
+    ("gain", "rank"), [(1.04, Rank.TO_KNOW), (1.1, Rank.DELAYS), (10.0, Rank.DELAYS)]
+)
+def test_a_wrong_gain_is_found_with_its_channel(gain: float, rank: Rank) -> None:
+    found = of(averages(bench(np.eye(3), np.diag([1.0, gain, 1.0]), np.eye(3))))
     first, second = advice_of(Gain, found)
     assert (first.sensors, first.channel, first.counterpart) == ((0, 1), 4, 1)
-    assert first.ratio == pytest.approx(1.05, abs=0.005)
+    assert first.ratio == pytest.approx(gain, rel=0.005)
     assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
-    assert second.ratio == pytest.approx(1 / 1.05, abs=0.005)
+    assert second.ratio == pytest.approx(1 / gain, rel=0.005)
+    assert (first.rank, second.rank) == (rank, rank)
 
 
 def test_reversed_polarity_is_found_with_its_channel() -> None:
