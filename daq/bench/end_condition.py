@@ -23,7 +23,7 @@ class EndCondition:
     cov : float or None
         Coefficient of variation of the noise in the worst third of an octave of the band.
     decided : bool
-        Whether the test ends once all limits are decided.
+        Whether the test ends once all limits are met, or one is not.
     """
 
     duration: float | None = None

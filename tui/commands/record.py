@@ -56,9 +56,9 @@ def record(
     operator : NAME
         Operator (default: from the bench file).
     until : CONDITION
-        Stop by the live estimate: 'decided' once all limits are decided, '5 %' once the noise in
-        the worst third of an octave of the band has a c.o.v. of 5 %, or both, separated by a comma:
-        the first of them.
+        Stop by the live estimate: 'decided' once all limits are met or one is not, '5 %' once the
+        noise in the worst third of an octave of the band has a c.o.v. of 5 %, or both, separated by
+        a comma: the first of them.
     until_stopped
         Ignore the duration of the bench file.
     check

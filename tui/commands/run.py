@@ -76,7 +76,7 @@ def run(
         Stop when the noise in the worst third of an octave of the band has this coefficient of
         variation.
     until_decided
-        Stop when all limits of the bench are decided.
+        Stop when all limits of the bench are met, or one is not.
     report : FILE
         Write the calibration report: .html or .pdf.
 
@@ -91,9 +91,10 @@ def run(
     --------------
     $ huddle run lab.toml --until-decided --duration 3h --report result.pdf
 
-    Reads the sensors of lab.toml until every limit is met or not met, for three
-    hours at most, shows the noise meanwhile, and writes result.pdf. The exit code
-    is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the test early.
+    Reads the sensors of lab.toml until all limits are met, or one is not, for
+    three hours at most, shows the noise meanwhile, and writes result.pdf.
+    The exit code is 0 for PASS, 1 for FAIL, 4 for not decided. Ctrl-C ends the
+    test early.
     """
     from daq.devices.bench_file import load
     from daq.estimation.settings import Settings

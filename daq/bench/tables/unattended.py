@@ -85,7 +85,7 @@ class ScheduledRun(BenchTable):
     target_cov: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
     """Coefficient of variation at which the run ends."""
     until: Literal["decided"] | None = None
-    """The run ends once its limits are decided."""
+    """The run ends once all limits are met, or one is not."""
     longest: Duration | None = None
     """Seconds after which a run with `target_cov` or `until` ends at the latest."""
     when_busy: Literal["skip", "queue"] = "skip"
