@@ -153,7 +153,7 @@ def issues(
     """
     from daq.recording.reader import Recording
 
-    if source.is_dir():
+    if source.is_dir() or not (source.exists() or source.suffix):
         ledger = Ledger(source)
         if not ledger.exists and Ledger(source / "certificates").exists:
             ledger = Ledger(source / "certificates")

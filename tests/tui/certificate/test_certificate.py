@@ -235,6 +235,8 @@ def test_a_revision_says_what_it_replaces_and_what_changed(copied: Laboratory) -
     code, said = copied.verify(copied.certificate(), copied.recording)
     assert code == 0
     assert "replaced by revision 1" in said
+    nowhere = CliRunner().invoke(app, ["issues", str(copied.recording.parent / "nowhere")])
+    assert "there is no ledger; huddle issue makes one" in nowhere.output
 
 
 def test_what_is_not_given_is_refused_unless_allowed(tmp_path: Path) -> None:
