@@ -5,13 +5,11 @@ Where motion is weak, noise that changes may look like it: directions are those 
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 
@@ -24,9 +22,7 @@ from estimator.checks.steadiness import (
     Regression,
     ResponseChange,
     ResponseScores,
-    noise_levels,
     regression,
-    response_change,
 )
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum, maximise
@@ -38,6 +34,8 @@ from estimator.types import BoolArray, FloatArray, IntArray
 
 KNOWN = 0.5
 """Standard error of the noise of a part, as a fraction, up to which its changes count."""
+TOGETHER = 1 << 16
+"""Values of the matrices of all parts of some bands, which are regressed together."""
 PAIR_BYTES = 1 << 24
 """Bytes of products of pairs of channels with all others that exist together: 16 MB."""
 SIGNIFICANCE = 3.0
@@ -113,51 +111,27 @@ class _Explained:
         return np.nan_to_num(self.added) if is_clear else np.zeros_like(self.added)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Scores:
     """Products of the noise of two channels in every part, over the frequencies of a band.
 
-    Parameters
+    Attributes
     ----------
-    n_channels : int
-    n_parts : int
+    score : float64, shape (n_parts, n_pairs)
+    theory, own : float64, shape (n_pairs,)
+        Variance of a score, with neighbours correlated; sum of those of frequencies.
+    products, squares : float64, shape (n_parts, n_parts)
+        Of the noise that different sensors share: sums over frequencies of products of two parts,
+        and of their squares. Zero where motion is not weak.
+    n_products : int
     """
 
-    def __init__(self, n_parts: int, n_channels: int) -> None:
-        self._i, self._j = np.array(list(combinations(range(n_channels), 2))).T
-        self._n_channels = n_channels
-        n_pairs = len(self._i)
-        self.score = np.zeros((n_parts, n_pairs))
-        self._theory, self._own = np.zeros(n_pairs), np.zeros(n_pairs)
-        self._products, self._squares = np.zeros((2, n_parts, n_parts))
-        self._n_products = 0
-
-    def add(
-        self, found: Regression, correlation: FloatArray, sensor_of: IntArray | None = None
-    ) -> None:
-        """Add frequencies; with the sensor of each channel, also for motion that is left."""
-        n_freqs = len(found.projector)
-        at_once = max(1, PAIR_BYTES // (16 * n_freqs * self._n_channels))
-        averages = 1 / np.mean(1 / found.averages)
-        products = np.zeros((n_freqs, *self._products.shape))
-        for low in range(0, len(self._i), at_once):
-            some = slice(low, low + at_once)
-            i, j = self._i[some], self._j[some]
-            projector = found.projector
-            with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-            score = 2 * (found.covariance[:, :, i, j] - projector[:, i, j].real)
-            score -= (found.noise[:, :, None, :] @ with_noise)[:, :, 0]
-            known = 2 * (projector[:, i, j] ** 2 + projector[:, i, i] * projector[:, j, j]).real
-            known -= np.einsum("fpa,fpa->fa", with_noise, found.inverse @ with_noise)
-            root = np.sqrt(np.clip(known, 0.0, None))
-            self.score[:, some] += score.sum(axis=1)
-            self._theory[some] += (root * (correlation @ root)).sum(axis=0) / averages
-            self._own[some] += known.sum(axis=0)
-            if sensor_of is not None:
-                shared = score[:, :, sensor_of[i] != sensor_of[j]].swapaxes(0, 1) / 2
-                products += shared @ shared.swapaxes(1, 2)
-                self._n_products += n_freqs * shared.shape[2]
-        self._products += products.sum(axis=0)
-        self._squares += (products**2).sum(axis=0)
+    score: FloatArray
+    theory: FloatArray
+    own: FloatArray
+    products: FloatArray
+    squares: FloatArray
+    n_products: float
 
     @property
     def left(self) -> float:
@@ -166,8 +140,8 @@ class _Scores:
         Over the noise, as two channels share it, rms of pairs. Noise of two parts is independent;
         motion has the directions of its frequency in both.
         """
-        apart = self._products * ~np.eye(len(self._products), dtype=np.bool_)
-        squares = self._squares.sum() - np.trace(self._squares)
+        apart = self.products * ~np.eye(len(self.products), dtype=np.bool_)
+        squares = self.squares.sum() - np.trace(self.squares)
         if not apart.sum() > SIGNIFICANCE * np.sqrt(2 * squares):
             return 0.0
         course = np.ones(len(apart))
@@ -175,13 +149,7 @@ class _Scores:
             course = apart @ course / (course @ course - course**2)
             course /= course.mean()
         power = course @ apart @ course / ((course @ course) ** 2 - (course**4).sum())
-        return float(np.sqrt(max(power, 0.0) / self._n_products) * course.std(ddof=1))
-
-    def of_parts(self, some: BoolArray) -> _Scores:
-        """Return those of some parts."""
-        found = copy.copy(self)
-        found.score = self.score[some]
-        return found
+        return float(np.sqrt(max(power, 0.0) / self.n_products) * course.std(ddof=1))
 
     def inflation(self, levels: PartLevels) -> float:
         """Return the variance of the scores of pairs over that for steady noise.
@@ -190,14 +158,14 @@ class _Scores:
         in part b has products of variance ``mean(l_b l_b')``; the fit expects the product of the
         means.
         """
-        significant = self._own > 0.1 * max(self._own.max(), np.finfo(np.float64).tiny)
+        significant = self.own > 0.1 * max(self.own.max(), np.finfo(np.float64).tiny)
         n_parts = len(self.score)
         ratio = 1.0
         if significant.any():
             found = self.score.var(axis=0, ddof=1)
-            ratio = float(np.mean(found[significant] / self._theory[significant]))
+            ratio = float(np.mean(found[significant] / self.theory[significant]))
         # The number of independent scores is about the number of channels.
-        error = float(np.sqrt(2 / ((n_parts - 1) * self._n_channels)))
+        error = float(np.sqrt(2 / ((n_parts - 1) * levels.level.shape[1])))
         level = levels.level / levels.level.mean(axis=0)
         square = (level**2).mean(axis=0)  # of like noise, the product
         # of which the scatter of the levels is a part, that alone exceeds twice itself at times;
@@ -211,21 +179,29 @@ class _Scores:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandSteadiness:
-    """What the parts show of one band; `levels` are None where they are too uncertain."""
+    """What the parts show of one band.
+
+    `levels` are None where they are too uncertain, `responses` where motion is weak. `inflation` is
+    the variance of the scores of pairs over that for steady noise, 1 where it is not known.
+    """
 
     explained: _Explained
     levels: PartLevels | None
     of_runs: PartLevels | None
     scores: _Scores
-    responses: ResponseScores
+    responses: ResponseScores | None
+    inflation: float
 
     def change(
-        self, sensor: int, begin: FloatArray, end: FloatArray, *, size: float
+        self, alike: ResponseChange, time: tuple[float, float], size: float
     ) -> ResponseChange:
-        """Return a change of this band alone, of any form: of `size` rms."""
-        found = response_change(self.responses, sensor, begin, end, 0)
-        if abs(found.size) < SURE * found.error:
-            found = replace(found, begin=float(begin[0]), end=float(end[-1]))
+        """Return a change of this band alone, of any form: of `size` rms.
+
+        From the change that is `alike` at its frequencies, of which the date is kept where it is
+        sure. Otherwise it changes all the `time`.
+        """
+        sure = abs(alike.size) >= SURE * alike.error
+        found = alike if sure else replace(alike, begin=time[0], end=time[1])
         explained = self.explained
         statistic, degrees = explained.clearest
         return replace(
@@ -255,17 +231,13 @@ class BandSteadiness:
         more = (self.levels.deviation**2 - self.levels.expected**2).max()
         return bool(0 < more < (LEFT * self.scores.left) ** 2)
 
-    @property
-    def inflation(self) -> float:
-        """Variance of the scores of pairs over that for steady noise; 1 where it is not known."""
-        return 1.0 if self.levels is None else self.scores.inflation(self.levels)
-
     def of_parts(self, some: BoolArray) -> BandSteadiness:
         """Return what some parts show of the noise."""
         if self.levels is None:
             return self
         levels = PartLevels(self.levels.level[some], self.levels.degrees[some])
-        return replace(self, levels=levels, scores=self.scores.of_parts(some))
+        scores = replace(self.scores, score=self.scores.score[some])
+        return replace(self, levels=levels, scores=scores, inflation=scores.inflation(levels))
 
 
 def is_weak_motion(maximum: Maximum) -> bool:
@@ -275,7 +247,7 @@ def is_weak_motion(maximum: Maximum) -> bool:
 
 
 def beside_weak_motion(
-    of_band: Callable[..., BandSteadiness | None],
+    of_bands: Callable[..., list[BandSteadiness | None]],
     parts: Parts,
     maximum: Maximum,
     places: IntArray,
@@ -308,19 +280,128 @@ def beside_weak_motion(
         found = maximise(both, 0)
     if shared > LEAKS or not found.converged[0] or found.boundary.any():
         return None
-    band = of_band(found, places, is_weak=True)
+    (band,) = of_bands(found, [places], is_weak=True)
     if band is None or band.is_of_motion:
         return None
     if found.n_factors and band.is_unsteady:  # its scatter may be in these
-        still = of_band(maximise(both, 0), places, is_weak=True)
-        return band if still is None else replace(band, scores=still.scores)
+        (still,) = of_bands(maximise(both, 0), [places], is_weak=True)
+        if still is not None and band.levels is not None:
+            inflation = still.scores.inflation(band.levels)
+            return replace(band, scores=still.scores, inflation=inflation)
     return band
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pieces:
+    """Neighbouring frequencies of bands, which have one or several pieces each.
+
+    Attributes
+    ----------
+    places : int64, shape (n_bins,)
+        Indices of the kept frequencies of parts.
+    of_band, sizes, counts : int64, shape (n_pieces,)
+        Band of each, number of its frequencies, number of the pieces of its band.
+    """
+
+    places: IntArray
+    of_band: IntArray
+    sizes: IntArray
+    counts: IntArray
+
+    @classmethod
+    def of(cls, bands: Sequence[IntArray], most: int) -> _Pieces:
+        """Return pieces of `most` frequencies at most; none of bands without any."""
+        counts = np.array([-(-len(each) // most) for each in bands])
+        split = [np.array_split(e, n) for e, n in zip(bands, counts.tolist(), strict=True) if n]
+        sizes = np.array([len(piece) for each in split for piece in each])
+        of_band = np.repeat(np.arange(len(bands)), counts)
+        return cls(np.concatenate(bands), of_band, sizes, np.repeat(counts, counts))
+
+    def together(self, most: int) -> Iterator[_Pieces]:
+        """Yield as many at a time as have `most` frequencies together, or one."""
+        end, first = np.cumsum(self.sizes), 0
+        while first < len(end):
+            last = int(np.searchsorted(end, end[first] - self.sizes[first] + most, side="right"))
+            rows = np.arange(len(end)) >= first
+            rows[max(last, first + 1) :] = False
+            first = max(last, first + 1)
+            yield self.take(rows)
+
+    def take(self, some: BoolArray) -> _Pieces:
+        """Return some of the pieces."""
+        found = self.of_band[some], self.sizes[some], self.counts[some]
+        return _Pieces(self.places[np.repeat(some, self.sizes)], *found)
+
+    @property
+    def slices(self) -> list[slice]:
+        """Frequencies of each piece."""
+        end = np.cumsum(self.sizes)
+        return [slice(b - n, b) for n, b in zip(self.sizes.tolist(), end.tolist(), strict=True)]
+
+    def sums(self, values: FloatArray | BoolArray) -> FloatArray:
+        """Return sums over the frequencies of each piece, which are the first axis."""
+        first = np.cumsum(self.sizes) - self.sizes
+        return np.add.reduceat(values, first, axis=0, dtype=np.float64)
+
+    def of_parts(self, values: FloatArray) -> FloatArray:
+        """Return sums as `sums` does; parts are the first axis, and then the second."""
+        found = np.add.reduceat(values, np.cumsum(self.sizes) - self.sizes, axis=1)
+        return np.asarray(found.swapaxes(0, 1))
+
+    def levels(self, found: Regression, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the noise of parts, (n_pieces, n_parts, n_channels), and its variance times n_k.
+
+        Both such that they add up to those of bands. `own` is the correlation of frequencies.
+        """
+        share, root = 1 / (self.counts * self.sizes), np.sqrt(np.einsum("fpp->fp", found.inverse))
+        variance = self.sums(root * (own @ root)) * share[:, None] ** 2
+        return self.of_parts(found.noise) * share[:, None, None], variance
+
+    def scores(
+        self, found: Regression, own: FloatArray, sensor_of: IntArray | None
+    ) -> dict[str, FloatArray]:
+        """Return sums of `_Scores`; with the sensor of each channel, also products."""
+        (n_parts, n_freqs, n_channels), P = found.noise.shape, found.projector
+        every = np.triu_indices(n_channels, 1)
+        at_once = max(1, PAIR_BYTES // (16 * n_freqs * n_channels))
+        averages = 1 / np.mean(1 / found.averages)
+        covariance, beside = self.of_parts(found.covariance), self.sums(P.real)[:, None]
+        products, n_products = np.zeros((n_freqs, n_parts, n_parts)), 0
+        pieces: list[tuple[FloatArray, ...]] = []
+        for low in range(0, len(every[0]), at_once):
+            i, j = (each[low : low + at_once] for each in every)
+            with_noise = 2 * (P[:, :, i].conj() * P[:, :, j]).real
+            known = 2 * (P[:, i, j] ** 2 + P[:, i, i] * P[:, j, j]).real
+            known -= np.einsum("fpa,fpa->fa", with_noise, found.inverse @ with_noise)
+            root = np.sqrt(np.clip(known, 0.0, None))
+            explained = [
+                found.noise[:, s].reshape(n_parts, -1) @ with_noise[s].reshape(-1, len(i))
+                for s in self.slices
+            ]
+            score = 2 * (covariance[..., i, j] - beside[..., i, j]) - np.stack(explained)
+            pieces.append((score, self.sums(root * (own @ root)) / averages, self.sums(known)))
+            if sensor_of is not None:
+                apart = sensor_of[i] != sensor_of[j]
+                i, j = i[apart], j[apart]
+                shared = found.covariance[:, :, i, j] - P[:, i, j].real
+                shared -= (found.noise[:, :, None, :] @ with_noise[:, :, apart])[:, :, 0] / 2
+                products += shared.swapaxes(0, 1) @ shared.transpose(1, 2, 0)
+                n_products += len(i)
+        score, theory, known = (np.concatenate(each, axis=-1) for each in zip(*pieces, strict=True))
+        return {
+            "score": score,
+            "theory": theory,
+            "own": known,
+            "products": self.sums(products),
+            "squares": self.sums(products**2),
+            "n_products": self.sizes * n_products,
+        }
 
 
 def band_steadiness(
     parts: Parts,
     maximum: Maximum,
-    places: IntArray,
+    bands: Sequence[IntArray],
     *,
     psd: FloatArray,
     is_weak: bool = False,
@@ -328,67 +409,124 @@ def band_steadiness(
     by_run: Sequence[IntArray],
     correlation: FloatArray,
     dims: tuple[int, ...],
-) -> BandSteadiness | None:
-    """Return what the parts show at some of their frequencies; None where that is too little.
+) -> list[BandSteadiness | None]:
+    """Return what the parts show of each band, at some of its frequencies.
 
-    Weak motion shows no response.
+    None where that is too little. Weak motion shows no response; its fit is of one frequency.
     """
-    if not len(places):
-        return None
-    at_once = max(1, VALUES_AT_ONCE // (len(parts.each) * sum(dims) ** 2))
-    q = max(1, maximum.n_factors)
-    levels, of_runs, responses = [], [], []
-    scores = _Scores(len(groups), sum(dims))
-    spread, beside = 0.0, np.zeros(sum(dims))
-    power, noise = np.zeros((2, len(groups), sum(dims)))
-    squares = np.zeros((sum(dims), sum(dims)))
-    for some in np.array_split(places, -(-len(places) // at_once)):
-        bins = parts.bins[some]
+    n_values, q = sum(dims) ** 2, max(1, maximum.n_factors)
+    sensor_of = np.repeat(np.arange(len(dims)), dims) if is_weak else None
+    lost: list[int] = []
+    of_pieces: list[tuple[IntArray, dict[str, FloatArray]]] = []
+    responses: list[list[ResponseScores]] = [[] for _ in bands]
+    pieces = _Pieces.of(bands, max(1, VALUES_AT_ONCE // (len(parts.each) * n_values)))
+    for some in pieces.together(max(1, TOGETHER // (len(groups) * n_values))):
+        divided = parts.joined(some.places, groups)
+        unknown = some.sums(~np.asarray(np.isfinite(divided.csm).all(axis=(0, 2, 3)))) > 0
+        if unknown.any():
+            lost += some.of_band[unknown].tolist()
+            kept = ~np.isin(some.of_band, lost)
+            divided = replace(divided, csm=divided.csm[:, np.repeat(kept, some.sizes)])
+            some = some.take(kept)  # noqa: PLW2901
+            if not len(some.places):
+                continue
+        bins, of_piece = parts.bins[some.places], np.repeat(np.arange(len(some.sizes)), some.sizes)
         lags = np.minimum(np.abs(bins[:, None] - bins), len(correlation) - 1)
-        divided, own = parts.joined(some, groups), correlation[lags]
+        own = np.where(of_piece[:, None] == of_piece, correlation[lags], 0.0)
         at = maximum.take(np.zeros_like(bins) if is_weak else bins)
-        if not np.isfinite(divided.csm).all():
-            return None
         found = regression(divided, at, psd[bins])
-        own_beside = np.einsum("fpp->p", found.projector).real
-        level = np.einsum("kfpp->kp", found.covariance)
-        motion = np.einsum("kfaa->k", found.motion).real / (found.averages + q) / (q * len(some))
-        used = (motion > LEAST_MOTION * (level / own_beside).max(axis=1)) & (not is_weak)
-        beside += own_beside / len(places)
+        spread = some.sums(own.sum(axis=1))
+        beside = some.sums(np.einsum("fpp->fp", found.projector).real)
+        noise = some.of_parts(np.einsum("kfpp->kfp", found.covariance))
+        motion = some.of_parts(np.einsum("kfaa->kf", found.motion).real / q)
+        motion /= (found.averages + q) * some.sizes[:, None]
+        used = (motion > LEAST_MOTION * (noise / beside[:, None]).max(axis=2)) & (not is_weak)
+        level, variance = some.levels(found, own)
+        sums = {
+            "level": level,
+            "variance": variance,
+            "spread": spread,
+            "beside": beside,
+            "noise": noise * used[:, :, None],
+            "power": np.zeros_like(noise),
+            "projectors": some.sums(np.abs(found.projector) ** 2),
+        }
         if used.any():
-            power += found.explained(used) / len(places)
-            noise += level * used[:, None] / len(places)
-        squares += (np.abs(found.projector) ** 2).sum(axis=0)
-        spread += own.sum()
-        piece = noise_levels(found, own)
-        levels.append(piece)
-        scores.add(found, own, np.repeat(np.arange(len(dims)), dims) if is_weak else None)
-        each = ResponseScores(dims, len(groups))
-        if not is_weak:
-            each.add(found, own)
-        responses.append(each)
+            sums["power"] = some.of_parts(found.explained(np.repeat(used.T, some.sizes, axis=1)))
+        sums |= some.scores(found, own, sensor_of)
         if by_run:
-            of_run = regression(parts.joined(some, by_run), at, psd[bins])
-            of_runs.append(noise_levels(of_run, own))
-    whole = PartLevels.joined(levels)
-    known = median(np.ravel(whole.degrees)) >= LEAST_DEGREES
-    total = parts.averages.sum()
-    # few averages of noise that changes look like a response, unless the motion is far stronger
-    strong = not is_weak and median(maximum.eigenvalues[parts.bins[places], q - 1]) > STRONG
-    more = scores.inflation(whole) if known else 1.0 if strong else np.inf
-    power, scatter = power.sum(axis=0) / total, more * q * noise.sum(axis=0) / total
+            of_run = regression(parts.joined(some.places, by_run), at, psd[bins])
+            sums["of_run"], sums["variance_of_run"] = some.levels(of_run, own)
+        of_pieces.append((some.of_band, sums))
+        if not is_weak:
+            more = (spread / some.sizes).tolist()
+            each = ResponseScores.of(found, dims, list(zip(some.slices, more, strict=True)))
+            for number, one in zip(some.of_band.tolist(), each, strict=True):
+                responses[number].append(one)
+    if not of_pieces:
+        return [None for _ in bands]
+    of_band = np.concatenate([each for each, _ in of_pieces])
+    names = of_pieces[0][1]
+    every = {name: np.concatenate([each[name] for _, each in of_pieces]) for name in names}
+    return [
+        None
+        if number in lost or not len(places)
+        else _of_band(
+            {name: each[of_band == number].sum(axis=0) for name, each in every.items()},
+            functools.reduce(operator.add, responses[number]) if responses[number] else None,
+            parts,
+            # few averages of noise that changes look like a response, unless motion is far stronger
+            is_strong=not is_weak
+            and bool(median(maximum.eigenvalues[parts.bins[places], q - 1]) > STRONG),
+            n_factors=maximum.n_factors,
+            n_freqs=len(places),
+            averages=[np.array([parts.averages[g].sum() for g in e]) for e in (groups, by_run)],
+        )
+        for number, places in enumerate(bands)
+    ]
+
+
+def _of_band(
+    sums: Mapping[str, FloatArray],
+    responses: ResponseScores | None,
+    parts: Parts,
+    *,
+    is_strong: bool,
+    n_factors: int,
+    n_freqs: int,
+    averages: Sequence[FloatArray],
+) -> BandSteadiness:
+    """Return what sums over the pieces of a band show; with averages of parts, and of runs."""
+    left, of_runs = (each[:, None] - n_factors for each in averages)
+    whole = PartLevels(1 + sums["level"], left / sums["variance"])
+    known = bool(median(np.ravel(whole.degrees)) >= LEAST_DEGREES)
+    scores = _Scores(
+        sums["score"],
+        sums["theory"],
+        sums["own"],
+        sums["products"],
+        sums["squares"],
+        float(sums["n_products"]),
+    )
+    more = scores.inflation(whole) if known else 1.0 if is_strong else np.inf
+    total, q, noise = parts.averages.sum(), max(1, n_factors), sums["noise"]
+    power = sums["power"].sum(axis=0) / total / n_freqs
+    scatter = more * q * noise.sum(axis=0) / total / n_freqs
     n_alike = noise.sum(axis=0) ** 2 / np.maximum((noise**2).sum(axis=0), np.finfo(np.float64).tiny)
     return BandSteadiness(
         _Explained(
             power=power,
             scatter=scatter,
-            beside=beside,
-            added=len(places) * fisher.covariance(squares[None])[0] @ (power - scatter),
-            degrees=2 * len(places) ** 2 / spread * float(n_alike.min()) * q,
-            left=total / len(groups) / q - 1,
+            beside=sums["beside"] / n_freqs,
+            added=n_freqs * fisher.covariance(sums["projectors"][None])[0] @ (power - scatter),
+            degrees=2 * n_freqs**2 / float(sums["spread"]) * float(n_alike.min()) * q,
+            left=total / len(left) / q - 1,
         ),
         whole if known else None,
-        PartLevels.joined(of_runs) if of_runs and known else None,
+        PartLevels(1 + sums["of_run"], of_runs / sums["variance_of_run"])
+        if known and len(of_runs)
+        else None,
         scores,
-        functools.reduce(operator.add, responses),
+        responses,
+        more if known else 1.0,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import field, replace
@@ -36,7 +37,6 @@ from estimator.checks.steadiness import (
     MIN_PARTS,
     PartLevels,
     ResponseChange,
-    ResponseScores,
     response_change,
     variance_of_changes,
 )
@@ -323,7 +323,7 @@ def stability(
     n_channels = maximum.psi.shape[1]
     begin, end = np.array([(parts.each[i[0]].begin, parts.each[i[-1]].end) for i in groups]).T
     correlation = np.concatenate([[1.0], neighbours, [0.0]])
-    of_band = functools.partial(
+    of_bands = functools.partial(
         band_steadiness,
         parts,
         psd=psd,
@@ -332,16 +332,14 @@ def stability(
         correlation=correlation,
         dims=dims,
     )
-    bands = []
-    for inside in insides:
-        some, whole = (each[inside[parts.bins[each]]] for each in (places, every))
-        if not doubtful and is_weak_motion(maximum.take(parts.bins[whole])):
-            bands.append(beside_weak_motion(of_band, parts, maximum, whole, psd))
-        else:
-            bands.append(of_band(maximum, some))
+    some, whole = ([e[inside[parts.bins[e]]] for inside in insides] for e in (places, every))
+    is_weak = [not doubtful and is_weak_motion(maximum.take(parts.bins[each])) for each in whole]
+    bands = of_bands(maximum, [e[:0] if weak else e for e, weak in zip(some, is_weak, strict=True)])
+    for number in np.flatnonzero(is_weak).tolist():
+        bands[number] = beside_weak_motion(of_bands, parts, maximum, whole[number], psd)
     found = [band for band in bands if band is not None]
     if doubtful:
-        bands = [None if band is None else replace(band, levels=None) for band in bands]
+        bands = [None if b is None else replace(b, levels=None, inflation=1.0) for b in bands]
     alarm = FALSE_ALARM / (n_channels * max(len(found), 1))
     explained = np.stack(
         [np.zeros(n_channels) if b is None else b.explained.where_clear(alarm) for b in bands]
@@ -482,8 +480,8 @@ def _also_by_band(
     most = np.maximum.reduceat(of_motion, first[:-1], axis=1)
     seen = most.max(axis=0) > LEAST_OF * most.max()
     usual = median(most[explained.any(axis=1)])
-    alike = np.maximum.reduceat(added, first[:-1]) > ALIKE * usual
-    found = [each for each in changes if seen[each.sensor] and alike[each.sensor]]
+    is_large = np.maximum.reduceat(added, first[:-1]) > ALIKE * usual
+    found = [each for each in changes if seen[each.sensor] and is_large[each.sensor]]
     named = {each.sensor for each in found}
     added = added * np.repeat([number in named for number in range(len(dims))], dims)
     worst = np.where(explained.any(axis=1), most.argmax(axis=1), -1)
@@ -491,13 +489,15 @@ def _also_by_band(
         own = np.flatnonzero(worst == sensor)
         at = int(own[most[own, sensor].argmax()])
         band = bands[at]
-        if not seen[sensor] or band is None:
+        if not seen[sensor] or band is None or band.responses is None:
             continue
         channels = slice(first[sensor], first[sensor + 1])
         added[channels] = of_motion[at, channels]
         size = math.sqrt(added[channels].max())
         span = float(edges[0][own[0]]), float(edges[1][own[-1]])
-        found.append(replace(band.change(sensor, *time, size=size), band=span))
+        alike = response_change(band.responses, sensor, *time, 0)
+        whole = float(time[0][0]), float(time[1][-1])
+        found.append(replace(band.change(alike, whole, size), band=span))
     return tuple(found), added
 
 
@@ -517,24 +517,27 @@ def _changed(
     loudest channel where the noise of the band is not steady. Where the noise is `doubtful`, it is
     a scale but for a factor.
     """
-    n_parts = len(begin)
-    total = ResponseScores(dims, n_parts)
+    n_parts, is_weighted = len(begin), False
+    found = []
     for band in bands:
-        if band is None or (band.levels is None and not doubtful):
+        if band is None or band.responses is None or (band.levels is None and not doubtful):
             continue
-        if band.levels is None:
-            total = total + band.responses
-            continue
-        # both: levels that are hardly known are below zero at times, and have no logarithm
-        linear = (n_parts - 1) * (band.levels.deviation / band.levels.expected) ** 2
-        most = critical_value(n_parts - 1, FALSE_ALARM)
-        unsteady = np.minimum(band.levels.statistic, linear) > most
-        level, responses = np.ones(n_parts), band.responses
-        if unsteady.any():
-            level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
-            responses = responses.beside_noise(unsteady)
-        total = total + responses.weighted(level)
-    total = total.centred()
+        responses = band.responses
+        if band.levels is not None:
+            # both: levels that are hardly known are below zero at times, and have no logarithm
+            linear = (n_parts - 1) * (band.levels.deviation / band.levels.expected) ** 2
+            most = critical_value(n_parts - 1, FALSE_ALARM)
+            unsteady = np.minimum(band.levels.statistic, linear) > most
+            if unsteady.any():
+                level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
+                responses = responses.beside_noise(unsteady).weighted(level)
+                is_weighted = True
+        found.append(responses)
+    if not found:
+        return (), np.zeros(sum(dims))
+    total = functools.reduce(operator.add, found)
+    if is_weighted:  # the mean of others is zero
+        total = total.centred()
     added = np.zeros(sum(dims))
     first = np.cumsum([0, *dims])
     changes = []

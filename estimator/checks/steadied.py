@@ -171,11 +171,10 @@ def _courses(
     each = np.eye(n)
     padded = np.concatenate([[2 * each[0] - each[1]], each, [2 * each[-1] - each[-2]]])
     slope, bend = (padded[2:] - padded[:-2]) / 2, np.diff(padded, n=2, axis=0)
-    inverse = np.linalg.inv(found.motion)
     own = np.einsum("fpp->fp", found.projector).real
     totals = found.averages + found.motion.shape[-1]
     across = found.motion / totals[:, None, None, None]
-    scatter = np.einsum("jfab,kfba->kjf", inverse, across).real
+    scatter = np.einsum("jfab,kfba->kjf", found.of_motion, across).real
     power, expected = [], []
     for course in (slope, bend):
         D = np.tensordot(course, found.coefficients, axes=1)
@@ -186,7 +185,7 @@ def _courses(
     G = found.coefficients @ U.conj().swapaxes(1, 2)
     D = (G[:, 2:] - G[:, :-2]) @ U[1:-1]
     edges = ((D @ across[:, 1:-1]) * D.conj()).sum(axis=3).real
-    spread = np.einsum("kfab,kfba->kf", inverse, across).real[..., None] * own
+    spread = np.einsum("kfab,kfba->kf", found.of_motion, across).real[..., None] * own
     # kept bins may lie apart; the first and last of a piece have one neighbour
     nearer = (2 / (bins[2:] - bins[:-2])) ** 2 * len(bins) / max(1, len(bins) - 2)
     left[:, 1:-1] += (edges - 2 * spread[:, 1:-1]) / 12 * nearer[:, None]

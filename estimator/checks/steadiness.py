@@ -22,6 +22,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.records import dataclass
 from estimator.spectra.parts import Divided
-from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_PARTS = 3
 MIN_DEGREES = 2.0
@@ -67,6 +68,10 @@ class Regression:
         ``n_k P S_k U``: coefficients times motion.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
         ``n_k U* S_k U``.
+    of_motion : complex128, of the same shape
+        Inverse of `motion`.
+    beside : float64, shape (n_parts, n_bins, n_channels)
+        Diagonal of ``P S_k P``.
     directions : complex128, shape (n_bins, n_channels, n_factors)
         U.
     projector : complex128, shape (n_bins, n_channels, n_channels)
@@ -84,6 +89,8 @@ class Regression:
     coefficients: ComplexArray
     along: ComplexArray
     motion: ComplexArray
+    of_motion: ComplexArray
+    beside: FloatArray
     directions: ComplexArray
     projector: ComplexArray
     averages: FloatArray
@@ -93,17 +100,19 @@ class Regression:
     noise: FloatArray
 
     def explained(self, some: BoolArray) -> FloatArray:
-        """Return what regressions of some parts explain that these do not share.
+        """Return what regressions of parts explain that these do not share.
 
-        Summed over frequencies, shape (n_parts, n_channels), times the averages of each part:
-        scatter alone explains one of the covariance for each direction of the motion.
+        Of `some`, (n_parts, n_bins). Shape (n_parts, n_bins, n_channels), times the averages of
+        each part: scatter alone explains one of the covariance for each direction of the motion.
         """
-        D, DW, W = self.coefficients[some], self.along[some], self.motion[some]
-        both = DW.sum(axis=0).swapaxes(1, 2), W.sum(axis=0).swapaxes(1, 2)
-        mean = np.linalg.solve(both[1], both[0]).swapaxes(1, 2)
-        found = np.zeros((len(some), D.shape[2]))
-        found[some] = ((DW - mean @ W) * (D - mean).conj()).sum(axis=(1, 3)).real
-        return found
+        along, M = self.along, self.motion
+        if not some.all():
+            along, M = (each * some[:, :, None, None] for each in (along, M))
+        M = M.sum(axis=0)
+        M[~some.any(axis=0)] = np.eye(M.shape[-1])
+        mean = along.sum(axis=0) @ np.linalg.inv(M)
+        beyond = self.along - mean @ self.motion
+        return _diagonal(beyond, self.coefficients - mean) * some[..., None]
 
     def beside_fit(self) -> ComplexArray:
         """Return `along` without what is wrong with the fit, alike in all parts.
@@ -120,11 +129,19 @@ class Regression:
         apart = np.tensordot(n, self.coefficients, axes=1) - total * mean
         # P diag(e) U of errors e, of which `inverse` over n is the covariance
         c = (np.einsum("fii,fii->f", self.inverse, self.projector).real - p) / ((p - q) * q)
-        known = np.tensordot(n**2, np.linalg.inv(M), axes=1) - total**2 * inverse
+        known = np.tensordot(n**2, self.of_motion, axes=1) - total**2 * inverse
         known += (total / np.where(c > 0, c, 1.0))[:, None, None] * np.eye(q)
         B = apart @ np.linalg.inv(known)
         A = mean - total * B @ inverse
         return np.asarray(self.along - n[:, None, None, None] * B - A @ M)
+
+
+def _diagonal(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Return the real diagonal of ``a b*``."""
+    return np.asarray(
+        np.einsum("...pa,...pa->...p", a.real, b.real)
+        + np.einsum("...pa,...pa->...p", a.imag, b.imag)
+    )
 
 
 def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
@@ -139,13 +156,13 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     fitted = np.einsum("fpp->fp", at.rest).real + share
     scale = np.sqrt(fitted / psd)
     S = parts.csm * (scale[:, :, None] * scale[:, None, :])
-    SU = S @ U
-    across = U.conj().swapaxes(1, 2) @ SU
+    across = U.conj().swapaxes(1, 2) @ (S @ U)
     across = (across + across.conj().swapaxes(2, 3)) / 2
     beside = at.projector
-    PSU = beside @ SU  # beside has more digits than 1 - U U*, where a channel is nearly motion
-    D = np.linalg.solve(across.swapaxes(2, 3), PSU.swapaxes(2, 3)).swapaxes(2, 3)
-    left = beside @ S @ beside - D @ PSU.conj().swapaxes(2, 3)
+    PS = beside @ S  # beside has more digits than 1 - U U*, where a channel is nearly motion
+    PSU, PSP, of_motion = PS @ U, PS @ beside, np.linalg.inv(across)
+    D = PSU @ of_motion
+    left = PSP - D @ PSU.conj().swapaxes(2, 3)
     covariance = left.real * (n / (n - q))[:, None, None, None]
     inverse = fisher.covariance(np.abs(beside) ** 2)
     excess = np.einsum("kfpp->kfp", covariance) - np.einsum("fpp->fp", beside).real
@@ -157,6 +174,8 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
         coefficients=D,
         along=n[:, None, None, None] * PSU,
         motion=n[:, None, None, None] * across,
+        of_motion=np.asarray(of_motion / n[:, None, None, None]),
+        beside=np.einsum("kfpp->kfp", PSP).real,
         directions=U,
         projector=beside,
         averages=n - q,
@@ -177,12 +196,6 @@ class PartLevels:
 
     level: FloatArray
     degrees: FloatArray
-
-    @classmethod
-    def joined(cls, pieces: Sequence[PartLevels]) -> PartLevels:
-        """Return the mean over pieces of a band, of as many frequencies each."""
-        inverse = np.mean([1 / each.degrees for each in pieces], axis=0) / len(pieces)
-        return cls(np.mean([each.level for each in pieces], axis=0), 1 / inverse)
 
     @property
     def statistic(self) -> FloatArray:
@@ -205,80 +218,139 @@ class PartLevels:
         return np.asarray(np.sqrt(np.mean(1 / self.degrees, axis=0)))
 
 
-def noise_levels(found: Regression, correlation: FloatArray) -> PartLevels:
-    """Return the noise of every part; `correlation` of bins has the shape (n_bins, n_bins)."""
-    root = np.sqrt(np.einsum("fpp->fp", found.inverse))
-    variance = np.einsum("fp,fg,gp->p", root, correlation, root) / len(root) ** 2
-    return PartLevels(1 + found.noise.mean(axis=1), found.averages[:, None] / variance)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Piece:
+    """Neighbouring frequencies of a band, of which the information of every sensor is made.
+
+    Attributes
+    ----------
+    beside : complex128, shape (n_bins, n_channels, n_channels)
+        P, by the scales of both channels.
+    along : complex128, shape (n_bins, n_channels, n_factors)
+        U over the scales.
+    motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
+    noise : float64, shape (n_parts, n_channels)
+        Noise of ``P S_k P`` less that of the fit, times the averages: mean over frequencies.
+    weight : float64, shape (n_parts,)
+        Of its scores.
+    """
+
+    beside: ComplexArray
+    along: ComplexArray
+    motion: ComplexArray
+    noise: FloatArray
+    weight: FloatArray
+
+    def information(self, one: slice, others: Sequence[slice]) -> FloatArray:
+        """Return that of a sensor's channels and neighbours', (n_parts, d*d, sum of their d*d)."""
+        first = others[0].start
+        felt = self.along[:, first : others[-1].stop] @ self.motion
+        felt = felt @ self.along[:, one].conj().swapaxes(1, 2)
+        found = [
+            _products(self.beside[:, one, each], felt[:, :, each.start - first : each.stop - first])
+            for each in others
+        ]
+        return np.concatenate(found, axis=2) * self.weight[:, None, None]
+
+    def weighted_motion(self) -> ComplexArray:
+        """Return the motion of all parts together, of which the weight is in the first one's."""
+        found = np.tensordot(self.weight / self.weight[0], self.motion, axes=1)
+        return np.asarray(found[None])
+
+    def scores(self, change: FloatArray) -> FloatArray:
+        """Return the scores of a change, (n_channels, n_channels) in and (n_parts, ...) out."""
+        X = (self.beside @ change @ self.along @ self.motion).swapaxes(1, 2)
+        across = self.along.swapaxes(0, 1).reshape(len(change), -1).conj().T
+        found = (X.reshape(-1, len(across)) @ across).real.reshape(len(X), *change.shape)
+        return np.asarray(self.weight[:, None, None] * found)
+
+    def by_noise(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Return scores of ``to, from`` by the noise of channels, shape (n_pairs, n_channels)."""
+        UU = self.along @ self.along.conj().swapaxes(1, 2)
+        return np.asarray((self.beside[:, a] * UU[:, :, b].swapaxes(1, 2)).real.sum(axis=0))
 
 
 class ResponseScores:
     """Scores of changes of every sensor's response in every part, summed over frequencies.
 
+    Information of pairs of sensors is made when it is asked for: that of each sensor alone tells
+    whether its response is steady.
+
     Parameters
     ----------
     dims : tuple of int
-    n_parts : int
+    score : float64, shape (n_parts, n)
+        Of pairs of channels within sensors.
+    own : list of float64, shape (n_parts, d*d, d*d)
+        Information of each sensor.
+    pieces : tuple of _Piece, optional
+        From which that of pairs of sensors is made.
+    information : float64, shape (n_parts, n, n), optional
+        Instead.
     """
 
-    def __init__(self, dims: tuple[int, ...], n_parts: int) -> None:
-        edges = np.cumsum([0, *dims])
-        pairs = [
-            (a, b)
-            for low, high in itertools.pairwise(edges)
-            for a in range(low, high)
-            for b in range(low, high)
-        ]
-        self._to, self._from = np.array(pairs).T
-        squares = np.cumsum([0, *(d * d for d in dims)])
-        self.of_sensor = [slice(low, high) for low, high in itertools.pairwise(squares)]
-        n = len(pairs)
-        self.score, self.information = np.zeros((n_parts, n)), np.zeros((n_parts, n, n))
-        self._by_noise, self._n_bins = np.zeros((n, edges[-1])), 0
-        self._averages, self._noise = np.zeros(n_parts), np.zeros((n_parts, edges[-1]))
-        self.dims = dims
+    def __init__(
+        self,
+        dims: tuple[int, ...],
+        score: FloatArray,
+        own: Sequence[FloatArray] = (),
+        pieces: tuple[_Piece, ...] = (),
+        information: FloatArray | None = None,
+    ) -> None:
+        self.dims, self.score, self._own, self._pieces = dims, score, own, pieces
+        self._information = information
 
-    def add(self, found: Regression, correlation: FloatArray) -> None:
-        """Add frequencies."""
-        a, b = self._to, self._from
-        U, P, s = found.directions, found.projector, found.scale
-        ratio = s[:, a] / s[:, b]
-        score = found.beside_fit() @ U.conj().swapaxes(1, 2)
-        # variance of the score, with neighbours correlated, over the independent one
-        more = float(correlation.sum() / len(correlation))
-        UU = U @ U.conj().swapaxes(1, 2)
-        by_noise = ratio[:, :, None] * (P[:, a] * UU[:, :, b].swapaxes(1, 2)).real
-        self._by_noise += 2 / more * by_noise.sum(axis=0)
-        self._averages = found.averages + U.shape[2]
-        explained = (found.along * found.coefficients.conj()).sum(axis=3).real
-        beside = np.einsum("kfpp->kfp", found.left).real - np.einsum("fpp->fp", P).real
-        excess = beside + explained / self._averages[:, None, None]
-        self._noise += (found.inverse @ excess[..., None])[..., 0].sum(axis=1)
-        self._n_bins += len(U)
-        self.score += 2 / more * (ratio * score[:, :, a, b].real).sum(axis=1)
-        beside, along = P * (s[:, :, None] * s[:, None, :]), U / s[:, :, None]
-        motion = along @ found.motion @ along.conj().swapaxes(1, 2)
-        edges = np.cumsum([0, *self.dims])
-        own = [slice(*each) for each in itertools.pairwise(edges)]
-        for (i, one), (j, other) in itertools.product(enumerate(own), repeat=2):
-            information = _products(beside[:, one, other], motion[:, :, other, one])
-            self.information[:, self.of_sensor[i], self.of_sensor[j]] += 2 / more * information
+    @classmethod
+    def of(
+        cls, found: Regression, dims: tuple[int, ...], pieces: Sequence[tuple[slice, float]]
+    ) -> list[ResponseScores]:
+        """Return those of pieces: their frequencies, and the variance of their sums.
+
+        With neighbours correlated, over that of independent ones.
+        """
+        P, s, n = found.projector, found.scale, found.averages + found.directions.shape[2]
+        beside, along = P * (s[:, :, None] * s[:, None, :]), found.directions / s[:, :, None]
+        scores = (s[:, :, None] * found.beside_fit()).swapaxes(1, 2)
+        excess = found.beside - np.einsum("fpp->fp", P).real
+        noise = (found.inverse @ excess[..., None])[..., 0]
+        (to, of), sensors = _within(dims), _sensors(dims)
+        every = []
+        for some, more in pieces:
+            own_noise = n[:, None] * noise[:, some].sum(axis=1) / (some.stop - some.start)
+            weight = np.full(len(n), 2 / more)
+            piece = _Piece(beside[some], along[some], found.motion[:, some], own_noise, weight)
+            across = piece.along.swapaxes(0, 1).reshape(len(s.T), -1).conj().T
+            score = (scores[:, :, some].reshape(-1, len(across)) @ across).real
+            own = [piece.information(each, [each]) for each in sensors]
+            score = 2 / more * score.reshape(len(n), *s.shape[1:], -1)[:, to, of]
+            every.append(cls(dims, score, own, (piece,)))
+        return every
+
+    @property
+    def information(self) -> FloatArray:
+        """Information of all sensors, shape (n_parts, n, n)."""
+        if self._information is None:
+            edges = _sensors(self.dims)
+            found = np.zeros((*self.score.shape, self.score.shape[1]))
+            for piece in self._pieces:
+                found += np.concatenate([piece.information(i, edges) for i in edges], axis=1)
+            self._information = found
+        return self._information
+
+    def _place(self, sensor: int) -> slice:
+        squares = np.cumsum([0, *(d * d for d in self.dims)])
+        return slice(squares[sensor], squares[sensor + 1])
 
     def sensor(self, sensor: int) -> tuple[FloatArray, FloatArray]:
         """Return score (n_parts, d*d) and information (n_parts, d*d, d*d) of a sensor."""
-        own = self.of_sensor[sensor]
-        return self.score[:, own], self.information[:, own, own]
-
-    def _like(self, score: FloatArray, information: FloatArray) -> ResponseScores:
-        found = ResponseScores(self.dims, len(score))
-        found.score, found.information = score, information
-        return found
+        own = self._place(sensor)
+        known = self._information
+        return self.score[:, own], self._own[sensor] if known is None else known[:, own, own]
 
     def __add__(self, other: ResponseScores) -> ResponseScores:
-        found = self._like(self.score + other.score, self.information + other.information)
-        found._by_noise, found._noise = self._by_noise + other._by_noise, self._noise + other._noise
-        found._averages, found._n_bins = self._averages, self._n_bins + other._n_bins
-        return found
+        own = [a + b for a, b in zip(self._own, other._own, strict=True)]
+        score, pieces = self.score + other.score, self._pieces + other._pieces
+        return ResponseScores(self.dims, score, own, pieces)
 
     def beside_noise(self, channels: BoolArray) -> ResponseScores:
         """Return the scores without what noise of some channels adds that is not that of the fit.
@@ -287,39 +359,64 @@ class ResponseScores:
         response that changes where motion is weak. The noise of a part is that of ``P S_k P``,
         which is unbiased if no response changes.
         """
-        noise = np.where(channels, self._noise / max(self._n_bins, 1), 0.0)
-        score = self.score - self._averages[:, None] * (noise @ self._by_noise.T)
-        return self._like(score, self.information)
+        score, size = self.score.copy(), sum(len(each.along) for each in self._pieces)
+        total = sum(len(each.along) * each.noise for each in self._pieces) / size
+        noise = np.where(channels, total, 0.0)
+        for each in self._pieces:
+            score -= each.weight[:, None] * (noise @ each.by_noise(*_within(self.dims)).T)
+        return ResponseScores(self.dims, score, self._own, self._pieces)
 
     def weighted(self, level: FloatArray) -> ResponseScores:
         """Return the scores where the noise has `level` in each part, shape (n_parts,)."""
-        return self._like(self.score / level[:, None], self.information / level[:, None, None])
+        own = [each / level[:, None, None] for each in self._own]
+        pieces = tuple(replace(each, weight=each.weight / level) for each in self._pieces)
+        return ResponseScores(self.dims, self.score / level[:, None], own, pieces)
 
     def centred(self) -> ResponseScores:
         """Return the scores beside the mean of responses over all parts, which is that of the fit.
 
         The fit is of other averages where parts were left out.
         """
-        inverse = np.linalg.pinv(self.information.sum(axis=0), rcond=1e-9, hermitian=True)
-        mean = inverse @ self.score.sum(axis=0)
-        return self._like(self.score - self.information @ mean, self.information)
+        alike = [
+            replace(each, motion=each.weighted_motion(), weight=each.weight[:1])
+            for each in self._pieces
+        ]
+        total = ResponseScores(self.dims, self.score[:1], pieces=tuple(alike)).information[0]
+        mean = np.zeros((sum(self.dims),) * 2)
+        to, of = _within(self.dims)
+        inverse = np.linalg.pinv(total, rcond=1e-9, hermitian=True)
+        mean[to, of] = inverse @ self.score.sum(axis=0)
+        score = self.score - sum(each.scores(mean)[:, to, of] for each in self._pieces)
+        return ResponseScores(self.dims, score, self._own, self._pieces)
 
     def without(self, sensors: Sequence[int]) -> ResponseScores:
         """Return what is left of the scores after the changes of some sensors are fitted."""
         if not sensors:
             return self
-        own = np.concatenate([np.arange(self.score.shape[1])[self.of_sensor[i]] for i in sensors])
+        own = np.concatenate([np.arange(self.score.shape[1])[self._place(i)] for i in sensors])
         score, information = self.score.copy(), self.information.copy()
         for k, each in enumerate(self.information):
             inverse = np.linalg.pinv(each[np.ix_(own, own)], rcond=1e-9, hermitian=True)
             taken = each[:, own] @ inverse
             score[k] -= taken @ self.score[k, own]
             information[k] -= taken @ each[own]
-        return self._like(score, information)
+        return ResponseScores(self.dims, score, information=information)
 
     def test(self, sensor: int, known: Sequence[int] = ()) -> tuple[float, float]:
         """Return chi-squared and degrees of a sensor, beside those known to change."""
         return _chi_squared(*self.without(known).sensor(sensor))
+
+
+def _sensors(dims: Sequence[int]) -> list[slice]:
+    """Return the channels of each sensor."""
+    return [slice(*each) for each in itertools.pairwise(np.cumsum([0, *dims]).tolist())]
+
+
+def _within(dims: Sequence[int]) -> tuple[IntArray, IntArray]:
+    """Return the pairs of channels of each sensor: to, from."""
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    to, of = np.nonzero(sensor[:, None] == sensor)
+    return to, of
 
 
 def _products(beside: ComplexArray, motion: ComplexArray) -> FloatArray:
@@ -341,14 +438,11 @@ def _chi_squared(score: FloatArray, information: FloatArray) -> tuple[float, flo
     if not np.isfinite(total).all():
         return math.nan, math.nan
     basis = _basis(total)
-    statistic, rank = 0.0, -basis.shape[1]
-    for s, each in zip(score, information, strict=True):
-        values, vectors = np.linalg.eigh(basis.T @ each @ basis)
-        known = values > 1e-9  # of one
-        along = vectors[:, known].T @ (basis.T @ s)
-        statistic += float(np.sum(along**2 / values[known]))
-        rank += int(known.sum())
-    return statistic, float(rank)
+    values, vectors = np.linalg.eigh(basis.T @ information @ basis)
+    known = values > 1e-9  # of one
+    along = (vectors.swapaxes(1, 2) @ (score @ basis)[:, :, None])[:, :, 0]
+    statistic = np.sum(along**2 / np.where(known, values, np.inf))
+    return float(statistic), float(known.sum() - basis.shape[1])
 
 
 def _basis(total: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -101,10 +102,10 @@ class Part:
         own = total if self.before is None else total - np.einsum("fii->fi", self.before)
         return np.asarray(own * self.scale[:, None])
 
-    def packed(self, some: slice | IntArray) -> FloatArray:
-        """Return the averages at some of the kept frequencies, as sums are kept."""
+    def packed(self, some: slice | IntArray, share: float = 1.0) -> FloatArray:
+        """Return the averages at some of the kept frequencies, as sums are kept, times a share."""
         packed = self.after[some] if self.before is None else self.after[some] - self.before[some]
-        return np.asarray(packed * self.scale[some, None, None])
+        return np.asarray(packed * (share * self.scale[some])[:, None, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,15 +140,13 @@ class Parts:
         """Return the parts of some channels, in ascending order."""
         if len(channels) == self.each[0].after.shape[1]:
             return self
-        own = np.ix_(channels, channels)
-
-        def packed(total: FloatArray | None) -> FloatArray | None:
-            return None if total is None else total[:, own[0], own[1]]
-
+        rows, columns = np.ix_(channels, channels)
+        ends = {id(end): end for part in self.each for end in (part.before, part.after)}
+        own = {n: end[:, rows, columns] for n, end in ends.items() if end is not None}
         return Parts(
             self.bins,
             tuple(
-                replace(part, before=packed(part.before), after=part.after[:, own[0], own[1]])
+                replace(part, before=own.get(id(part.before)), after=own[id(part.after)])
                 for part in self.each
             ),
             None if self.response is None else self.response[:, list(channels)],
@@ -165,9 +164,28 @@ class Parts:
 
     def joined(self, some: slice | IntArray, groups: Sequence[IntArray]) -> Divided:
         """Return the matrices of groups of parts, as `csm` does those of all parts."""
-        packed = np.stack([part.packed(some) for part in self.each])
-        found = joined_parts(packed, self.averages, groups)
-        return replace(found, csm=self._unpacked(found.csm.real, some))
+        averages = self.averages
+        joined = [
+            functools.reduce(np.add, (own.packed(some, s) for own, s in self._merged(group)))
+            for group in groups
+        ]
+        sums = np.array([averages[own].sum() for own in groups])
+        return Divided(self._unpacked(np.stack(joined), some), sums)
+
+    def _merged(self, group: IntArray) -> Iterator[tuple[Part, float]]:
+        """Yield parts of a group, neighbours of equal weight as one, and their shares of it."""
+        averages = self.averages[group]
+        shares = (averages / averages.sum()).tolist()
+        part, share = self.each[group[0]], shares[0]
+        for number, own in zip(group[1:].tolist(), shares[1:], strict=True):
+            following = self.each[number]
+            is_alike = own == share and np.array_equal(following.scale, part.scale)
+            if is_alike and following.before is part.after:
+                part = replace(part, after=following.after)
+            else:
+                yield part, share
+                part, share = following, own
+        yield part, share
 
     def _unpacked(self, packed: FloatArray, some: slice | IntArray) -> ComplexArray:
         turned, lower = packed.swapaxes(2, 3), lower_triangle(packed.shape[-1])
