@@ -100,7 +100,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share[:, None]))
-    found += _of_two(snapshot, method, psd)
+    found += [*_of_two(snapshot, method, psd), *_alone(snapshot, psd.shape)]
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     found += _contradicted(snapshot, method, tuple(found))
@@ -434,6 +434,21 @@ def _of_two(snapshot: Snapshot, method: str, psd: FloatArray) -> Iterator[Contri
     if below.any():
         shares = share[:, None]
         yield contribution(Source.SHARED_NOISE, psd.shape, below=below, above=above, share=shares)
+
+
+def _alone(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
+    """Yield that all noise of a sensor beside the motion of the others may be motion.
+
+    Of three sensors none has noise that is known (`_misfits`).
+    """
+    below, frequency = np.zeros(shape), snapshot.frequency
+    sensor = np.repeat(np.arange(len(snapshot.dims)), snapshot.dims)
+    for advice in snapshot.diagnostics.advice if len(snapshot.dims) > _THREE else ():
+        if isinstance(advice, NoSharedMotion) and advice.band is not None:
+            here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
+            below[np.ix_(here, np.isin(sensor, advice.sensors))] = math.inf
+    if below.any():
+        yield contribution(Source.MISFIT, shape, below=below)
 
 
 def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:

@@ -431,6 +431,7 @@ class Kind:
 STEADY = ("ResponseChanges",)
 NOISE = ("NoiseChanges",)
 LINEAR = ("NotLinear",)
+SHARED = ("SharedNoise", "SharedByTwo")
 KINDS: Mapping[str, Kind] = {
     "nothing": Kind(_nothing),
     "nothing, red motion": Kind(_red(-0.5)),
@@ -474,10 +475,10 @@ KINDS: Mapping[str, Kind] = {
     "gusts below 5 Hz in the noise of all": Kind(_gusty, NOISE, names_sensor=False),
     "30 spikes in one channel": Kind(_spikes, (*NOISE, "DisturbedSegments")),
     "two channels of two sensors share half of their noise": Kind(
-        _shared(1.0), ("SharedNoise",), names_sensor=False
+        _shared(1.0), SHARED, names_sensor=False
     ),
     "two channels of two sensors share a fifth of their noise": Kind(
-        _shared(0.25), ("SharedNoise",), names_sensor=False
+        _shared(0.25), SHARED, names_sensor=False
     ),
     "noise that all channels of a sensor share": Kind(_shared_within),
     "a second motion, felt to another degree": Kind(
@@ -497,9 +498,7 @@ KINDS: Mapping[str, Kind] = {
         _jumps, ("SamplesUncounted", "ClockNotUnderstood", "Delay", "StatedTimesDrift", *STEADY)
     ),
     "a fifth of a channel in one of another sensor": Kind(_crosstalk),
-    "half of a channel's noise in another sensor": Kind(
-        _leaks, ("SharedNoise",), names_sensor=False
-    ),
+    "half of a channel's noise in another sensor": Kind(_leaks, SHARED, names_sensor=False),
     "a sensor 26 dB quieter": Kind(_quiet),
     "a sensor 26 dB louder": Kind(_loud),
     "a line 34 dB above the motion": Kind(_line),

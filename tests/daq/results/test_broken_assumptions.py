@@ -48,6 +48,19 @@ def white(rng: np.random.Generator, n_sensors: int) -> np.ndarray:
     return rng.standard_normal((n_sensors, N_SAMPLES, 3))
 
 
+def test_noise_of_a_sensor_that_feels_other_motion_has_no_lower_end() -> None:
+    rng = np.random.default_rng(6)
+    noise, motion = white(rng, 5), felt(rng, 5, 100.0)
+    motion[1] = 10 * rng.standard_normal((N_SAMPLES, 3))
+    snapshot = estimated(motion, noise)
+    inside = held(snapshot, noise)
+    assert inside[:, 3:6].all()
+    assert inside.mean() > 0.9
+    (result,) = snapshot.results.values()
+    means = Result(snapshot, SETTINGS).means(result.method, BANDS[0])
+    assert [each.low[0] > 0 for each in means] == [True] * 3 + [False] * 3 + [True] * 9
+
+
 @pytest.mark.parametrize("snr", [0.05, pytest.param(0.02, marks=pytest.mark.long)])
 def test_motion_that_the_test_of_fewer_dimensions_hides_is_in_the_interval(snr: float) -> None:
     """Of five per cent in all directions, one factor takes up enough to pass, and leaves most."""
