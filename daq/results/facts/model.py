@@ -16,6 +16,7 @@ from estimator.likelihood.dimension import BandDimension
 from estimator.records import Hertz, Share
 from estimator.wording import Words, few, listed, percent, span
 
+_THREE = 3  # sensors
 _WHY_UNTESTED = {
     Untested.UNFINISHED: "The diagnosis follows with the first segments.",
     Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
@@ -83,10 +84,13 @@ class ModelPasses(Fact):
 
     def _words(self) -> Words:
         two = "or two of these three " if self.dims == (1, 1, 1) else ""  # the test has one degree
+        # felt to degrees g, it adds (g_i - g_j) (g_i - g_k) of itself to the noise: no misfit
+        degrees = ", and no motion that they feel to different degrees"
+        assumed = f"no noise that all {two}sensors share{degrees * (len(self.dims) == _THREE)}"
         return Words(
             "The model test passes in all bands",
             f"The model test passes in all bands: {model(self.n_factors, self.dims)} explains "
-            f"what the sensors have in common. Assumed: no noise that all {two}sensors share.",
+            f"what the sensors have in common. Assumed: {assumed}.",
         )
 
 
