@@ -20,7 +20,7 @@ from estimator.likelihood.factor_analysis import Maxima, max_factors, maximise, 
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.likelihood.prior import expected_noise, kinds, maximise_expecting
 from estimator.likelihood.shared_by_two import SHARING, PairSearch
-from estimator.median import median
+from estimator.median import median, median_of_columns
 from estimator.records import Hertz, dataclass
 from estimator.self_noise.coherency import (
     PresentSensors,
@@ -349,6 +349,7 @@ def choose_dimension(
     sharers = PairSearch(
         lambda q, b, group: search.sensor_test(q, b, group, r),
         search.axes,
+        search.noise,
         dims=there.dims,
         usual=usual,
         level=level,
@@ -439,6 +440,7 @@ class _Search:
     ) -> None:
         self._maxima, self._dims, self._stride = maxima, dims, stride
         self.axes: dict[int, ComplexArray] = {}
+        self.noise: dict[int, FloatArray] = {}
         self._matrix = matrix
         self._psd = psd
         self._number = number
@@ -467,7 +469,9 @@ class _Search:
             )
         if q <= self._usual + 1:
             for b in some:
-                self.axes[b] = maximum.eigenvectors[self._number[rows] == b]
+                here = self._number[rows] == b
+                self.axes[b] = maximum.eigenvectors[here]
+                self.noise[b] = median_of_columns(maximum.psi[here] * self._psd[rows[here]])
         error = standard_error(maximum, n_effective=self._n_effective)
         return _Fit(
             number=self._number[rows],

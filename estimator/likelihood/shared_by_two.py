@@ -29,6 +29,8 @@ SHARING = 4
 """Sensors from which noise that two of them share is told from motion."""
 LOCAL = 0.75
 """Share of a direction of the motion in two sensors from which these may share noise instead."""
+BEYOND_ALIKE = 1 / 3
+"""Share of a direction that the others may have, over that of motion which all feel alike."""
 CANDIDATES = 2
 """Pairs of sensors that are tried at most, those with the largest shares."""
 EXPLAINS = 0.75
@@ -113,6 +115,8 @@ class PairSearch:
     test : callable
     axes : mapping of int to complex128, shape (n_rows, n_channels, n_factors)
         Directions of the motion in each band.
+    noise : mapping of int to float64, shape (n_channels,)
+        Noise of the channels there, in any unit.
     dims : tuple of int
         Channels of each sensor.
     usual : int
@@ -125,12 +129,13 @@ class PairSearch:
         self,
         test: Test,
         axes: Mapping[int, ComplexArray],
+        noise: Mapping[int, FloatArray],
         *,
         dims: tuple[int, ...],
         usual: int,
         level: float,
     ) -> None:
-        self._test, self._axes, self._dims = test, axes, dims
+        self._test, self._axes, self._noise, self._dims = test, axes, noise, dims
         self._usual, self._level = usual, level
         self._alone = np.arange(len(dims))
 
@@ -160,8 +165,9 @@ class PairSearch:
         tried, whose dimensions beyond the motion show no share.
         """
         share = local_shares(self._axes[band], self._dims)
+        least = self._least(band) if q < self._usual else np.full(share.shape, LOCAL)
         every = sorted(combinations(self._alone.tolist(), 2), key=lambda pair: -share[pair])
-        likely = [each for each in every if share[each] > LOCAL][:CANDIDATES]
+        likely = [each for each in every if share[each] > least[each]][:CANDIDATES]
         few = len(self._dims) == SHARING
         likely = every if few and any_pair else likely
         pairs: list[Pair] = []
@@ -185,6 +191,16 @@ class PairSearch:
                 return None
             pairs, at = [*pairs, best], tests[best]
         return None if at is None else self._fewest(q, at, pairs, band, every if few else likely)
+
+    def _least(self, band: int) -> FloatArray:
+        """Return the share from which two sensors may share noise, where motion may fade.
+
+        In units of the noise, motion that all feel alike is mostly in the quietest.
+        """
+        first = np.cumsum([0, *self._dims[:-1]])
+        power = np.add.reduceat(1 / self._noise[band], first)
+        alike = (power[:, None] + power) / power.sum()
+        return np.asarray(np.maximum(LOCAL, 1 - BEYOND_ALIKE * (1 - alike)))
 
     def _mirrors(self, pair: Pair, other: Pair) -> bool:
         """Whether one pair of four channels explains what the other two share.

@@ -11,6 +11,8 @@ from daq.formats.arrays import recording_of_arrays
 from daq.results.facts.model import SharedByTwo
 from daq.results.result import Result
 from estimator.checks.advice_on_noise import SharedNoise
+from estimator.likelihood.dimension import choose_dimension
+from tests.estimator.csm_models import wishart
 
 RATE, SECONDS = 100.0, 120.0
 UNIT = 2 / RATE
@@ -91,3 +93,21 @@ def test_motion_of_all_sensors_is_no_noise_of_two(n_sensors: int, d: int) -> Non
         samples = recorded(n_sensors, d, ratio, rng, shared=False)
         result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
         assert not any(choice.pairs for choice in result.snapshot.diagnostics.dimensions)
+
+
+@pytest.mark.parametrize("seed", [1, 10])
+def test_motion_that_fades_is_no_noise_of_the_two_quietest_sensors(seed: int) -> None:
+    """In units of the noise, most of what all feel alike is in the quietest."""
+    rng = np.random.default_rng(seed)
+    dims, n = (3,) * 5, 70
+    turned = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in dims])
+    noise = np.repeat([1.0, 0.12, 1.0, 0.25, 0.7], 3)
+    frequency = np.linspace(0.5, 50.0, 120)
+    fading = np.geomspace(3.0, 0.03, len(frequency))
+    csm = fading[:, None, None] * (turned @ turned.T) + np.diag(noise)
+    averages = wishart(csm.astype(np.complex128), n, rng)[0]
+    _, choices = choose_dimension(
+        averages, frequency, dims=dims, n_effective=n, neighbours=np.zeros(0)
+    )
+    assert any(each.n_factors < 3 for each in choices)
+    assert not any(each.pairs for each in choices)
