@@ -215,7 +215,9 @@ def level_budget(
         raise ArithmeticError(f"{label.name}: {low, high} does not hold the statistical {inner}")
     scale = abs(level) if level else math.nan
     variance = float(found.of_scatter.cumulants[0, row, column])
-    deviation = math.sqrt(variance) / scale if variance else 0.0
+    deviation = 0.0
+    if variance:
+        deviation = math.inf if variance < 0 else math.sqrt(variance) / scale
     parts = [
         Component(
             "estimate", "A", "chi-squared", deviation,

@@ -68,7 +68,7 @@ def interval(
         construction), where z is corrected for skewness (Cornish and Fisher) and for the scatter of
         the deviation. The interval is asymmetric: the chi-squared interval if the estimate is a
         single PSD, and also valid for negative estimates. `high` is infinite if the averages are
-        too few to bound it.
+        too few to bound it; both are where T_2 is negative, as it may be where motion is singular.
 
     Notes
     -----
@@ -78,6 +78,7 @@ def interval(
     quantile of Student's t, ``z + (z**3 + z) / (4 nu)``. For a single PSD nu is infinite.
     """
     t2, t3, t4 = cumulants
+    without = np.where(t2 < 0, np.inf, 0.0)  # of a singular triad, and of no scatter
     certain = t2 <= 0
     t2 = np.where(certain, 1.0, t2)
     slope, curvature = t3 / t2, t4 / t2**2
@@ -95,7 +96,7 @@ def interval(
         bounded = (reach > 0) & ((side < 0) | ((square > 0) & (curvature < 1)))
         distance = np.full_like(reach, np.inf)
         np.divide(kappa * t2, reach, out=distance, where=bounded)
-        ends.append(level + side * np.where(certain, 0.0, distance))
+        ends.append(level + side * np.where(certain, without, distance))
     return ends[0], ends[1]
 
 

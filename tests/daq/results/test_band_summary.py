@@ -58,6 +58,15 @@ def test_a_level_below_its_bound_keeps_its_ends() -> None:
     assert (high > found.mean).all()
 
 
+def test_a_budget_says_that_a_scatter_is_not_known() -> None:
+    """`--json` of a bench with a clipped sensor ended in the root of a negative variance."""
+    found, labels = bounded_by(0.5), made_snapshot().channels
+    scatter = replace(found.of_scatter, cumulants=-found.of_scatter.cumulants)
+    budget = level_budget(replace(found, of_scatter=scatter), 0, labels[0], (1.0, 2.0))
+    assert np.isinf(budget.components[0].relative)
+    assert np.isneginf(budget.ends[0])
+
+
 @pytest.mark.parametrize("share", [1e-3, 0.01, 0.1, 0.3, 0.6, 0.9, 1.1, 3.0, 100.0])
 def test_no_estimate_is_exported_beside_an_interval_that_excludes_it(share: float) -> None:
     """The mean of a band was 194 beside an upper end of 40.7, in JSON and certificates."""

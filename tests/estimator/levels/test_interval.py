@@ -20,6 +20,12 @@ def test_the_interval_of_a_psd_is_chi_squared(n: int) -> None:
     np.testing.assert_allclose([low[0], high[0]], exact, rtol=0.15 / n)
 
 
+def test_an_estimate_whose_variance_comes_out_negative_has_no_ends() -> None:
+    """It had an interval of no width: the triad of three-sensor is singular there."""
+    low, high = interval(np.ones(2), np.array([[0.0, -0.1], [0.0, 0.1], [0.0, 0.1]]))
+    np.testing.assert_equal([low, high], [[1.0, -np.inf], [1.0, np.inf]])
+
+
 def test_an_estimated_scatter_gives_the_interval_of_student() -> None:
     """Cross-spectrum of two independent channels: symmetric, of n degrees of freedom."""
     n = 30
