@@ -64,7 +64,7 @@ def test_a_budget_says_that_a_scatter_is_not_known() -> None:
     scatter = replace(found.of_scatter, cumulants=-found.of_scatter.cumulants)
     budget = level_budget(replace(found, of_scatter=scatter), 0, labels[0], (1.0, 2.0))
     assert np.isinf(budget.components[0].relative)
-    assert np.isneginf(budget.ends[0])
+    assert np.isneginf(budget.interval[0])
 
 
 @pytest.mark.parametrize("share", [1e-3, 0.01, 0.1, 0.3, 0.6, 0.9, 1.1, 3.0, 100.0])
