@@ -124,7 +124,6 @@ class NotOrthogonal(Advice):
 
     def _words(self, names: Names) -> Words:
         one, other = (names.sensors[sensor] for sensor in self.sensors)
-        one, other = (names.sensors[sensor] for sensor in self.sensors)
         return Words(
             f"Channels of {one} or {other} are {self.deviation_deg:.1f}° off a right angle",
             f"Channels of sensor {one} or {other} deviate by {self.deviation_deg:.1f}° from a "
@@ -229,9 +228,6 @@ class Delay(Advice):
     delay_samples: float
 
     def _words(self, names: Names) -> Words:
-        early, late = (names.sensors[sensor] for sensor in self.sensors)
-        if self.delay < 0:
-            early, late = late, early
         early, late = (names.sensors[sensor] for sensor in self.sensors)
         if self.delay < 0:
             early, late = late, early

@@ -202,6 +202,13 @@ def advise(
     misfits = [e for e in others if isinstance(e, advice_on_model.ModelMisfit) and e.is_wrong]
     failed = [(0.0, nyquist) if e.band is None else e.band for e in misfits]
     low, high = min((e[0] for e in failed), default=nyquist), max((e[1] for e in failed), default=0)
+    pairs = [advice for response in responses for advice in orientation(response, dims, nyquist)]
+    swapped = {
+        sensor
+        for each in pairs
+        if isinstance(each, advice_on_sensors.SwappedChannels)
+        for sensor in each.sensors
+    }
     found = [
         *_absent(given, dims),
         *(each for each in further if not isinstance(each, NoiseChanges)),
@@ -218,7 +225,12 @@ def advise(
         ),
         *strangers,
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
-        *(advice for response in responses for advice in orientation(response, dims, nyquist)),
+        *(  # a swap, against a sensor turned far from its own, looks like a reversal
+            each
+            for each in pairs
+            if not isinstance(each, advice_on_sensors.ReversedPolarity)
+            or swapped.isdisjoint(each.sensors)
+        ),
     ]
     order = list(Rank)
     return tuple(sorted(found, key=lambda advice: order.index(advice.rank)))

@@ -186,6 +186,10 @@ def test_swapped_channels_are_distinguished_from_a_rotated_sensor() -> None:
     assert swapped[0].channels == ((3, 1), (4, 0))
     assert swapped[1].channels == ((6, 4), (7, 3))
     assert not advice_of(ReversedPolarity, found)
+    far = Rotation.from_euler("z", 60, degrees=True).as_matrix()
+    beside = of(averages(bench(np.eye(3), near[[1, 0, 2]], far)))  # of it no swap is said
+    assert [advice.sensors for advice in advice_of(SwappedChannels, beside)] == [(0, 1)]
+    assert not advice_of(ReversedPolarity, beside)
     turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     other = of(averages(bench(np.eye(3), turned, np.eye(3))))
     assert not advice_of(SwappedChannels, other)
