@@ -291,7 +291,7 @@ class _Run:
 
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):
-            parts.append(f"c.o.v. {self._cov:.3f}")
+            parts.append(f"worst c.o.v. {self._cov:.3f}")
         state = " · ".join([*parts, *filter(None, [self._left])])
         self._show(clock_time(elapsed), elapsed, self._end, state)
 

@@ -139,7 +139,7 @@ def _line(result: Result, now: RecordingStatus | None) -> str:
         left = result.remaining(now.until, now.elapsed)
         state = how_long(left, now.in_local_time(left.seconds))
     cov = result.precision().cov
-    known = "" if math.isnan(cov) else f"c.o.v. {cov:.3f}  "
+    known = "" if math.isnan(cov) else f"worst c.o.v. {cov:.3f}  "
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 

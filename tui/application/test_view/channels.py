@@ -27,7 +27,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
     if result is None:
         return Table((), ())
     snapshot, data, alone, covs = result.snapshot, result.data, result.alone, result.covs
-    titles = ["noise, 95 %", "c.o.v.", "margin, dB", "SNR, dB", "data", "gaps"]
+    titles = ["noise, 95 %", "worst c.o.v.", "margin, dB", "SNR, dB", "data", "gaps"]
     columns: dict[str, list[Cell]] = {title: [] for title in ("channel", *titles)}
     margins = worst_by_channel(result.verdict)
     if not margins:
@@ -45,7 +45,7 @@ def channel_table(state: State, choice: Choice, *, means: Sequence[BandMeans], w
             cells["noise, 95 %"] = Cell(level_with_error(mean, high, low))
             cells["SNR, dB"] = Cell(_ratio(float(data[column]), mean))
         if not math.isnan(covs[column]):
-            cells["c.o.v."] = Cell(percent(covs[column]))
+            cells["worst c.o.v."] = Cell(percent(covs[column]))
         worst = margins.get((label.sensor, label.channel))
         if worst is not None and worst.known:
             words = f"{MARKS[worst.verdict]} {signed(worst.margin_db, '+.1f')}"

@@ -249,13 +249,14 @@ def note(now: RecordingStatus | None, done: int, total: int) -> str:
 
 
 def known_to(reached: Precision) -> str:
-    """Return the scatter of the noise, and the one that is wanted.
+    """Return the scatter of the noise in the worst third of an octave, and the one that is wanted.
 
     How well the noise is known is the whole interval, beside each level.
     """
     wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"
-    known = "not known yet" if reached.cov > NOT_KNOWN_FROM else f"c.o.v. {percent(reached.cov)}"
-    return f"{known}{wanted}"
+    if reached.cov > NOT_KNOWN_FROM:
+        return f"not known yet{wanted}"
+    return f"worst c.o.v. {percent(reached.cov)}{wanted}"
 
 
 def _gone_on(now: RecordingStatus, snapshot: Snapshot) -> float:
