@@ -45,4 +45,6 @@ def simulate(
     """
     from tui.simulation.write_recording import simulate_recording
 
+    if out.suffix.lower() not in {".h5", ".hdf5"}:
+        raise typer.BadParameter(f"{out}: expected a file name that ends in .h5")
     simulate_recording(scenario, out=out, duration=duration, json=json)

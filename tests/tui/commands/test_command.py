@@ -171,6 +171,12 @@ def test_the_manual_has_every_command() -> None:
         assert (done.stdout + done.stderr, done.returncode) == ("", 0)
 
 
+def test_a_simulation_is_not_written_under_the_name_of_another_format(tmp_path: Path) -> None:
+    refused = huddle("simulate", "fig9", "--out", str(tmp_path / "x.txt"), code=2)
+    assert "expected a file name that ends in .h5" in " ".join(refused.stderr.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_closed_pipe_is_no_failed_limit(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     printed("simulate", "fig9", "--duration", "2min", "--out", str(path))
