@@ -424,6 +424,7 @@ def _verified(path: Path) -> dict[str, Any]:
     return {
         "intact": report.intact,
         "closed": report.closed,
+        "being_written": report.being_written,
         "damaged": [*damaged, *report.damaged_tables, *report.changed],
         "root_sha256": report.root_sha256,
         "run_id": report.run_id,

@@ -117,6 +117,9 @@ def verified(
             state = f"intact, signed with key {signer.key_id}"
         if names and state.startswith("intact"):
             state += f", certified by {'; '.join(names)}"
+        if state == "intact" and not report["closed"]:
+            written = report["being_written"]
+            state += ", being written" if written else ", not closed: huddle repair closes it"
         yield Verified(path, state, report.get("root_sha256") or "", report.get("warning", ""))
 
 

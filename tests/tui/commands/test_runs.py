@@ -5,15 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
+from contextlib import closing
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq.bench.channel import Channel
 from daq.errors import HuddleError
+from daq.protocols.block import Block, HostTime
+from daq.recording.file_format import SensorLayout
+from daq.recording.writer import RecordingWriter
 from tests.command import huddle, printed
 from tests.torture.damaged_files import make_recording
 from tests.tui.schemas import validate
@@ -59,7 +66,7 @@ def test_runs_as_table_json_and_csv(place: Path) -> None:
     )
     assert [row["reason"] for row in rows] == ["'=1+1", ""]  # no formula for a spreadsheet
     nowhere = huddle("runs", str(place.parent), code=2)
-    assert "runs.sqlite: does not exist" in nowhere.stderr
+    assert "runs.sqlite: does not exist; expected a bench file" in nowhere.stderr
 
 
 def test_pinned_by_recording_or_time(place: Path) -> None:
@@ -92,6 +99,20 @@ def test_verify_walks_what_is_kept(place: Path) -> None:
     assert "1 of 1 recordings are damaged or lost" in result.stderr
     path.unlink()
     printed("verify", str(place), code=3)
+
+
+def test_verify_says_that_a_recording_is_not_closed(tmp_path: Path) -> None:
+    open_, killed = tmp_path / "open.h5", tmp_path / "killed.h5"
+    layout = SensorLayout("a", (Channel(name="x", sensitivity=1.0),), 100.0, np.dtype("i4"))
+    now = HostTime(0, 0)
+    with closing(RecordingWriter.create(open_, sensors=[layout], created=now)) as writer:
+        writer.append(Block("a", 0, np.ones((100, 1), np.int32), now))
+        writer.commit()
+        shutil.copy(open_, killed)
+        said = printed("verify", str(open_), str(killed)).splitlines()
+    assert said[0] == f"{open_}: intact, being written"
+    assert said[1] == f"{killed}: intact, not closed: huddle repair closes it"
+    assert printed("verify", str(open_)) == f"{open_}: intact\n"
 
 
 def test_status_with_and_without_a_service(place: Path) -> None:
