@@ -67,6 +67,10 @@ def test_runs_as_table_json_and_csv(place: Path) -> None:
     assert [row["reason"] for row in rows] == ["'=1+1", ""]  # no formula for a spreadsheet
     nowhere = huddle("runs", str(place.parent), code=2)
     assert "runs.sqlite: does not exist; expected a bench file" in nowhere.stderr
+    (place.parent / "recordings" / "runs.sqlite").unlink()
+    for command in ("runs", "verify", "history"):
+        told = " ".join(huddle(command, str(place), code=2).stderr.split())
+        assert f"no service of {place} has run (huddle serve)" in told
 
 
 def test_pinned_by_recording_or_time(place: Path) -> None:

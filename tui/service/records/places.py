@@ -46,10 +46,10 @@ class Place:
         bench = None if source.is_dir() else load(source)
         folder = source if bench is None else bench.recording_directory
         if not (folder / NAME).exists():
-            raise NoServiceError(
-                f"{folder / NAME}: does not exist; expected a bench file or a folder that huddle"
-                " serve has used"
-            )
+            wanted = "expected a bench file or a folder that huddle serve has used"
+            if bench is not None:
+                wanted = f"no service of {source} has run (huddle serve)"
+            raise NoServiceError(f"{folder / NAME}: does not exist; {wanted}")
         return cls(folder, bench)
 
     @property
