@@ -14,7 +14,7 @@ from daq.results.facts.fact import Fact
 from daq.results.facts.model import _is_young
 from daq.results.vocabulary import FLAG_WORDS
 from estimator.checks.advice import Rank
-from estimator.checks.advice_on_signals import Copies, NoSharedMotion, NoSignal
+from estimator.checks.advice_on_signals import Copies, MissingChannels, NoSharedMotion, NoSignal
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
@@ -187,9 +187,11 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
         yield LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel")
     named = any(isinstance(each, NoSignal | Copies) for each in advice)  # once for all methods
     hidden = Flag.DEAD_CHANNEL | Flag.DUPLICATE if named else Flag(0)
+    explained = named and any(isinstance(each, MissingChannels) for each in advice)
     alone = any(isinstance(each, NoSharedMotion) for each in advice)
     for method, noise in snapshot.results.items():
-        yield from without_estimate(snapshot, method, besides=hidden)
+        lacks = Flag.SINGULAR if explained and method == "three-sensor" else Flag(0)
+        yield from without_estimate(snapshot, method, besides=hidden | lacks)
         pooled = ((noise.flags[1:-1] & Flag.POOLED) != 0).any(axis=1)
         if pooled.any() and not alone:  # a longer recording would not help sensors alone
             frequency = snapshot.frequency[1:-1][pooled]
