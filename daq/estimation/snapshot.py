@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from daq.bench.sensitivity import Sensitivities
 from daq.caveats import NO_CAVEATS, Caveats
-from daq.clocks.clock_model import ClockState
+from daq.clocks.clock_model import ClockSource, ClockState
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     added_by_clocks,
@@ -333,6 +333,7 @@ class Snapshot:
             self.dims,
             frozenset((*self.results, *chosen)),
             self.start_utc_ns,
+            frozenset(c.sensor for c in self.clocks if c.source is ClockSource.SAMPLE_INSTANTS),
         )
 
     @property

@@ -61,6 +61,8 @@ class Names:
         and the methods of the results.
     start_utc_ns : int
         UTC of the start; 0: not known.
+    polled : frozenset of str
+        Sensors without a clock: each sample has the host's time.
     """
 
     sensors: tuple[str, ...]
@@ -68,6 +70,7 @@ class Names:
     dims: tuple[int, ...]
     in_use: frozenset[str] = frozenset()
     start_utc_ns: int = 0
+    polled: frozenset[str] = frozenset()
 
     def list_sensors(self, sensors: Sequence[int]) -> str:
         """Return sensors as a list."""

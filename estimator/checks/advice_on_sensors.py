@@ -231,11 +231,16 @@ class Delay(Advice):
         early, late = (names.sensors[sensor] for sensor in self.sensors)
         if self.delay < 0:
             early, late = late, early
+        line, do = "synchronise the clocks", "Synchronise the clocks"
+        if polled := [name for name in (early, late) if name in names.polled]:
+            be = "are" if polled[1:] else "is"
+            line = f"{listed(polled)} {be} polled; let the host do less"
+            do = f"{listed(polled)} {be} polled, without a clock to set: let the host do less"
         return Words(
-            f"{late} lags {early} by {abs(self.delay) * 1e3:.3g} ms: synchronise the clocks",
+            f"{late} lags {early} by {abs(self.delay) * 1e3:.3g} ms: {line}",
             f"The samples of {late} lag those of {early} by {abs(self.delay) * 1e3:.3g} ms "
             f"({abs(self.delay_samples):.2g} samples): {EFFECT_OF_DELAY}.",
-            "Synchronise the clocks, and use a tapered window.",
+            f"{do}, and use a tapered window.",
         )
 
     def _together(self, found: Sequence[Self], names: Names) -> str:

@@ -7,10 +7,13 @@ from itertools import combinations
 
 import pytest
 
+from daq.clocks.clock_model import ClockSource
 from daq.results.facts.fact import Finding
 from estimator.checks.advice import Advice, Rank
+from tests.tui.example_snapshot import made_snapshot
 from tests.tui.wording.advice_examples import (
     EXAMPLES,
+    LEADS,
     MISFIT,
     ROTATED,
     names,
@@ -42,6 +45,16 @@ def test_what_to_do_about_a_misfit_is_for_these_sensors() -> None:
     assert "--method auto" in MISFIT.words(names(*"abcde")).line
     axes = names(*"abcd", n_channels=1)  # --method auto is three-sensor for them
     assert "auto" not in MISFIT.words(axes).action + MISFIT.words(axes).line
+
+
+def test_nobody_is_told_to_synchronise_a_polled_sensor() -> None:
+    made = made_snapshot()
+    *others, last = made.clocks
+    clocks = (*others, replace(last, source=ClockSource.SAMPLE_INSTANTS))
+    words = replace(LEADS, sensors=(1, 2)).words(replace(made, clocks=clocks).names)
+    assert words.line == "B lags C by 20 ms: C is polled; let the host do less"
+    assert "C is polled, without a clock to set" in words.action
+    assert "synchronise" in LEADS.words(replace(made, clocks=clocks).names).line
 
 
 @pytest.mark.parametrize("advice", EXAMPLES)
