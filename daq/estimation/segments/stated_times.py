@@ -54,6 +54,7 @@ _MOST_FALSE = 0.1  # of the delays
 _FEWEST = 3  # delays of a part: one or two may be false
 _BLIND = 4.0  # samples of scatter within parts: most peaks are false. Drifts leave 3 at most
 _SCATTERS = 3.0  # times the predicted scatter: the times of single blocks are wrong
+_CLEARLY = 2.0  # times the scatter of all parts: that of one is known from a few delays
 _GROWTH = 0.5  # of the stretch whose clocks are set, from one setting to the next
 _STEP = 16  # pieces that are measured in between
 _AGREE = 25.0  # χ² of 7 degrees of freedom: 8e-4. More is no news yet: pieces are measured then
@@ -293,6 +294,9 @@ def drift_of(
     if np.mean(false) > _MOST_FALSE or np.count_nonzero(agrees) < 2 * n_parts:
         return math.nan
     at, delays, part = at[agrees], delays[agrees], part[agrees]
+    own = _scatter_of_bends(delays, std[agrees], part)
+    blind = own > max(_SCATTERS * scatter, _COARSE / sampling_rate)
+    spread = np.where(own > _CLEARLY * scatter, np.maximum(spread, own), spread)
     n = np.bincount(part, minlength=_PARTS)
     means = np.bincount(part, delays, minlength=_PARTS) / np.maximum(n, 1)
     between = float(n @ (means - delays.mean()) ** 2)
@@ -300,7 +304,7 @@ def drift_of(
     chi_square = float(weight @ (means - weight @ means / weight.sum()) ** 2)
     drifts = chi_square > _DRIFTS * _OVERLAPS and between > len(at) * least**2
     if not drifts and (nominal or within <= _SCATTERS * least):
-        return 0.0
+        return math.nan if blind.any() else 0.0
     slope = float(np.polyfit(at, delays, 1)[0])
     return max(abs(slope) * duration / math.sqrt(12), float(np.std(delays)))
 
@@ -318,6 +322,20 @@ def _scatter_of_parts(
         own = _NORMAL * median(away[part == each])
         if own > _SCATTERS * scatter:
             found[each] = max(scatter, min(own, most))
+    return found
+
+
+def _scatter_of_bends(delays: FloatArray, std: FloatArray, part: IntArray) -> FloatArray:
+    """Return the scatter in each part by how three pieces bend: drifts are smooth.
+
+    Weak motion has more than is predicted.
+    """
+    found = np.zeros(_PARTS)
+    for each in np.unique(part):
+        own, bends = std[part == each], np.abs(np.diff(delays[part == each], n=2))
+        if len(bends):
+            predicted = np.sqrt(own[2:] ** 2 + 4 * own[1:-1] ** 2 + own[:-2] ** 2)
+            found[each] = _NORMAL * median(bends / predicted) * median(own)
     return found
 
 
