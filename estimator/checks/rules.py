@@ -22,7 +22,7 @@ import numpy as np
 
 from estimator.checks import advice_on_model, advice_on_sensors, advice_on_signals
 from estimator.checks.advice import Advice, Rank
-from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
+from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, SharedNoise
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.sensitivities import TOLERANCE
@@ -203,12 +203,10 @@ def advise(
     failed = [(0.0, nyquist) if e.band is None else e.band for e in misfits]
     low, high = min((e[0] for e in failed), default=nyquist), max((e[1] for e in failed), default=0)
     pairs = [advice for response in responses for advice in orientation(response, dims, nyquist)]
-    swapped = {
-        sensor
-        for each in pairs
-        if isinstance(each, advice_on_sensors.SwappedChannels)
-        for sensor in each.sensors
-    }
+    swapped = _named(pairs, advice_on_sensors.SwappedChannels)
+    changed = moved | _named(
+        [*further, *strangers], ResponseChanges, advice_on_signals.NoSharedMotion
+    )
     found = [
         *_absent(given, dims),
         *(each for each in further if not isinstance(each, NoiseChanges)),
@@ -226,7 +224,9 @@ def advise(
         *strangers,
         *(each for each in others if not any(_overlap(each, other) for other in strangers)),
         *(  # a swap, against a sensor turned far from its own, looks like a reversal
-            each
+            replace(each, rank=Rank.TO_KNOW)
+            if isinstance(each, advice_on_sensors.Gain) and not changed.isdisjoint(each.sensors)
+            else each
             for each in pairs
             if not isinstance(each, advice_on_sensors.ReversedPolarity)
             or swapped.isdisjoint(each.sensors)
@@ -234,6 +234,11 @@ def advise(
     ]
     order = list(Rank)
     return tuple(sorted(found, key=lambda advice: order.index(advice.rank)))
+
+
+def _named(advice: Iterable[Advice], *kinds: type[Advice]) -> frozenset[int]:
+    """Return the sensors that advice of some kinds names."""
+    return frozenset(n for each in advice if isinstance(each, kinds) for n in each.sensors)
 
 
 def _overlap(one: Advice, other: Advice) -> bool:

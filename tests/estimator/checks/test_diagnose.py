@@ -15,6 +15,7 @@ from estimator.checks.advice_on_model import (
     TooFewDimensions,
     WeakMotion,
 )
+from estimator.checks.advice_on_noise import ResponseChanges
 from estimator.checks.advice_on_sensors import (
     Delay,
     Gain,
@@ -25,9 +26,11 @@ from estimator.checks.advice_on_sensors import (
 )
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
+from estimator.checks.rules import advise
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import rejected_below
+from estimator.self_noise.coherency import coherency
 from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import pentagon, plane_waves, random_bench, wishart
 
@@ -155,6 +158,24 @@ def test_a_wrong_gain_is_found_with_its_channel(gain: float, rank: Rank) -> None
     assert (second.sensors, second.channel, second.counterpart) == ((1, 2), 7, 4)
     assert second.ratio == pytest.approx(1 / gain, rel=0.005)
     assert (first.rank, second.rank) == (rank, rank)
+
+
+def test_a_gain_of_a_sensor_that_changes_is_no_wrong_sensitivity() -> None:
+    """Of a sensor that was carried away, the first line said "correct its sensitivity"."""
+    csm = averages(bench(np.eye(3), np.eye(3), 0.8 * np.eye(3)))
+    found = of(csm)
+    change = ResponseChanges(
+        rank=Rank.DELAYS, sensors=(2,), channel=None, is_turn=False, size=-0.5, size_error=0.01,
+        begin=30.0, end=30.0, variance=0.06,
+    )  # fmt: skip
+    advice = advise(
+        found.bands, found.responses, coherency(csm, THREE), dims=THREE, n_factors=3,
+        n_effective=1080, nyquist=100.0, further=(change,),
+    )  # fmt: skip
+    gains = [each for each in advice if isinstance(each, Gain)]
+    assert len(gains) == 2
+    assert {each.rank for each in gains} == {Rank.TO_KNOW}
+    assert {each.rank for each in advice_of(Gain, found)} == {Rank.DELAYS}
 
 
 def test_reversed_polarity_is_found_with_its_channel() -> None:
