@@ -186,7 +186,8 @@ class Schemas:
             yield keys[each.name], _known(made), True
         for key, name in getattr(kind, "IN_JSON", {}).items():
             found = getattr(kind, name)
-            made = self.of(eval(found.fget.__annotations__["return"], _names(kind.__module__)))  # noqa: S307 - ours
+            hints = get_type_hints(found.fget, _names(kind.__module__), include_extras=True)
+            made = self.of(hints["return"])
             text = _NULL.sub("null", plain_text(inspect.getdoc(found) or ""))
             yield key, made | {"description": text}, True
 
