@@ -109,7 +109,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.CLOCKS: "clocks",
     Source.EDGES: "edges of segments",
     Source.GAPS: "gaps",
-    Source.MISFIT: "a model test that fails",
+    Source.MISFIT: "motion that sensors do not share",
     Source.SHARED_NOISE: "shared noise",
     Source.AXES: "axes that may be off",
     Source.DIMENSIONS: "the number of dimensions",
