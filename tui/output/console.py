@@ -177,7 +177,7 @@ def write_json(file: str | None, document: Mapping[str, Any]) -> None:
     """Write a document as one line of JSON, if a file is given; infinite numbers become null."""
     if file is None:
         return
-    from tui.output.json_values import json_text  # noqa: PLC0415 - loads numpy and pydantic
+    from tui.output.json_values import json_text  # noqa: PLC0415 - loads numpy
 
     with growing(file) as write:
         write(json_text(document))
