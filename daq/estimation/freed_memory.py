@@ -8,8 +8,6 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import cache
 
-FREED_FROM = 1 << 25
-"""Bytes of the matrices of all frequencies from which an estimate returns memory between stages."""
 LARGE = 1 << 21
 """Size in bytes from which an array gets a mapping of its own, but within an estimate. Mappings
 cost system time. Live estimate of 2 h of three triaxial sensors: 2 s without mappings, 8 s with

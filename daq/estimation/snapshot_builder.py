@@ -32,7 +32,7 @@ from daq.estimation.diagnosis import (
     synchronisation,
 )
 from daq.estimation.equalisation import METHOD, Equalisation
-from daq.estimation.freed_memory import FREED_FROM, give_back
+from daq.estimation.freed_memory import give_back
 from daq.estimation.linearity import linearised, nonlinear_channels
 from daq.estimation.noise_estimates import (
     Channels,
@@ -263,7 +263,7 @@ class SnapshotBuilder:
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_unused = sum(each.n_segments for each in passes), 0
-        if final and csm.nbytes > FREED_FROM:
+        if final:
             give_back()
         of_all, maxima = (bands, raw, recordings[0], first, n_segments), Maxima()
         estimates = self._estimates(*of_all, maxima=maxima, final=final, levels=bool(sets))
@@ -285,7 +285,7 @@ class SnapshotBuilder:
         left = _not_estimated(latest, channels)
         counting = _counting_rates(latest) if final else {}
         nonlinear = nonlinear_channels(passes, frequency, channels, self._unit) if final else ()
-        if final and csm.nbytes > FREED_FROM:
+        if final:
             give_back()
         psd = np.diagonal(csm, axis1=1, axis2=2).real
         if final or (self._diagnoses.is_due and not left):

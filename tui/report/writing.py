@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 
 from daq.bench.masks.mask import Mask
 from daq.errors import HuddleError
+from daq.estimation.freed_memory import give_back
 from daq.results.result import Result
 from daq.whole_file import write_whole
 from tui.page.blocks import Report
@@ -111,6 +112,7 @@ def written(report: Report, suffix: str) -> bytes:
         return page(report).encode("utf-8")
     from tui.page.pdf import write_paper  # noqa: PLC0415 - loads fpdf2
 
+    give_back()  # of the estimate; fonts take as much
     paper = io.BytesIO()
     write_paper(report, paper)
     return paper.getvalue()
