@@ -54,6 +54,8 @@ NO_NOISE = 0.1
 _THREE = 3  # sensors
 UNCERTAIN = 0.3
 """Share of what squares and cubes explain by which it is uncertain."""
+MOST_FREQUENCIES = 0.5
+"""Share of the frequencies of a band without noise from which a motion, and no line, is felt."""
 NOTHING_USEFUL = 1.0
 """Share of the noise by which a model that fails may be off, from which nothing is known."""
 
@@ -96,10 +98,10 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         share = dimensions[:, None]
         found.append(contribution(Source.DIMENSIONS, shape, below=below, above=above, share=share))
     taken = psd * _taken_for_motion(snapshot, method)
-    for source, share in _misfits(snapshot, explained).items():
+    for source, share in _misfits(snapshot, method, psd, explained).items():
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
-            found.append(contribution(source, shape, above=above, share=share[:, None]))
+            found.append(contribution(source, shape, above=above, share=share))
     found += [*_of_two(snapshot, method, psd), *_alone(snapshot, psd.shape)]
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
@@ -185,13 +187,11 @@ def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:
     Where squares and cubes explain much, other terms may be there: the noise may be any smaller.
     """
     explained, below = np.zeros((2, *psd.shape))
-    block = blocks_of(snapshot.frequency)
-    first = np.flatnonzero(np.diff(block, prepend=-1))
     for each in snapshot.nonlinear:
         explained[:, each.column] = each.explained
         before = psd[:, each.column] + (each.explained if snapshot.linearised else 0.0)
-        part, whole = (np.add.reduceat(values, first) for values in (each.explained, before))
-        much = (part > MUCH_NONLINEAR * whole)[block]
+        part, whole = (_by_block(snapshot.frequency, power) for power in (each.explained, before))
+        much = part > MUCH_NONLINEAR * whole
         usual = (UNCERTAIN if snapshot.linearised else 1 + UNCERTAIN) * each.explained
         below[:, each.column] = np.where(much, np.maximum(usual, psd[:, each.column]), usual)
     if snapshot.nonlinear:
@@ -451,11 +451,13 @@ def _alone(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]
         yield contribution(Source.MISFIT, shape, below=below)
 
 
-def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArray]:
-    """Return what failed tests of the model allow, as shares, shape (n_freqs,) each."""
+def _misfits(
+    snapshot: Snapshot, method: str, psd: FloatArray, explained: BoolArray
+) -> dict[Source, FloatArray]:
+    """Return what failed tests of the model allow, as shares, (n_freqs, n_channels) each."""
     frequency = snapshot.frequency
     every = may_share(snapshot)[0]
-    found = {source: np.zeros(len(frequency)) for source in (Source.MISFIT, Source.SHARED_NOISE)}
+    found = {source: np.zeros(psd.shape) for source in (Source.MISFIT, Source.SHARED_NOISE)}
     for advice in snapshot.diagnostics.advice:
         if advice.band is None or advice.rank is Rank.TO_KNOW:
             continue
@@ -465,6 +467,8 @@ def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArra
             here &= ~explained
             useful = advice.error < NOTHING_USEFUL and not every[here].any()
             error = advice.error if useful else math.inf
+            second = _second_motion(snapshot, method, psd, advice)
+            found[source] = np.maximum(found[source], np.where(explained[:, None], 0.0, second))
         elif isinstance(advice, SharedNoise):
             source, error = Source.SHARED_NOISE, advice.harm
         elif isinstance(advice, TooFewDimensions):
@@ -474,3 +478,31 @@ def _misfits(snapshot: Snapshot, explained: BoolArray) -> dict[Source, FloatArra
             error = math.inf
         found[source][here] = np.maximum(found[source][here], error)
     return found
+
+
+def _second_motion(
+    snapshot: Snapshot, method: str, psd: FloatArray, advice: ModelMisfit
+) -> FloatArray | float:
+    """Return what a motion that three sensors feel to different degrees may be of their noise.
+
+    As a share, shape (n_freqs, n_channels), infinite from 1. Beside the band whose test fails it
+    is the same part of the motion: there the test passes as long as all noise stays positive. A
+    band that fails by a line, or by shared noise, has no sensor without noise.
+    """
+    frequency, (low, high) = snapshot.frequency, advice.worst_band
+    failed = (frequency >= low) & (frequency <= high)
+    none = (snapshot.results[method].flags[failed] & (Flag.NEGATIVE | Flag.BOUNDARY)) != 0
+    if len(snapshot.dims) != _THREE or not (none.mean(axis=0) > MOST_FREQUENCIES).any():
+        return 0.0
+    motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
+    part = advice.error * np.median(psd[failed]) / np.median(motion[failed])
+    moving, noise = (_by_block(frequency, values) for values in (motion, psd))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.nan_to_num(part * moving / noise)
+    return np.where(share < NOTHING_USEFUL, share, math.inf)
+
+
+def _by_block(frequency: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the sums of values over blocks, at every frequency."""
+    block = blocks_of(frequency)
+    return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(block, prepend=-1)))[block])

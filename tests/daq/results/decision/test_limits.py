@@ -23,7 +23,7 @@ from estimator.levels.contributions import Source
 from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
-from estimator.self_noise.result import SelfNoise
+from estimator.self_noise.result import Flag, SelfNoise
 from tests.daq.results.decision.benches import bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 
@@ -247,16 +247,21 @@ def test_the_noise_of_a_clipped_channel_is_an_upper_bound() -> None:
     assert verdict_on(replace(snapshot, diagnostics=clipped), 12e-12).verdict is Verdict.PASS
 
 
-def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> None:
+def with_misfit(low: float) -> Snapshot:
+    """Say that the model fails by 90 % of the noise from a frequency on."""
     snapshot = diagnosed(n_effective=5000.0)
     assert snapshot.diagnostics.diagnosis is not None
     misfit = ModelMisfit(
-        rank=Rank.INVALIDATES, band=(0.5, 99.0), n_factors=3, statistic=50.0, worst_statistic=50.0,
-        worst_band=(0.5, 99.0), p_value=0.0, unexplained=0.1, error=0.9, largest_error=9.0,
+        rank=Rank.INVALIDATES, band=(low, 99.0), n_factors=3, statistic=50.0, worst_statistic=50.0,
+        worst_band=(low, 99.0), p_value=0.0, unexplained=0.1, error=0.9, largest_error=9.0,
         is_wrong=True,
     )  # fmt: skip
     diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(misfit,))
-    wrong = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
+    return replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
+
+
+def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> None:
+    wrong = with_misfit(0.5)
     for psd in (10e-12, 6.5e-12):
         found = verdict_on(wrong, psd)
         assert found.verdict is Verdict.NOT_DECIDED
@@ -264,6 +269,21 @@ def test_where_the_model_fails_by_more_than_the_margin_nothing_is_decided() -> N
         assert found.prediction is None
     assert verdict_on(wrong, 5e-11).verdict is Verdict.PASS  # by more than the misfit can do
     assert verdict_on(wrong, 1e-14).verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(("last", "known"), [(99.0, False), (70.0, True)])
+def test_a_second_motion_is_felt_beside_the_band_that_shows_it(last: float, known: bool) -> None:
+    wrong = with_misfit(50.0)
+    noise = wrong.results["three-sensor"]
+    none = (wrong.frequency >= 50) & (wrong.frequency <= last)  # a line is at few frequencies
+    flags = np.where(none[:, None] & (np.arange(9) >= 6), Flag.NEGATIVE, noise.flags)
+    results = {"three-sensor": replace(noise, flags=flags.astype(noise.flags.dtype))}
+    (misfit,) = (
+        each
+        for each in contributions(replace(wrong, results=results), "three-sensor")
+        if each.source is Source.MISFIT
+    )
+    assert np.all(misfit.share[2:20] == (0.0 if known else np.inf))  # 10 to 1000 times the noise
 
 
 CHOSEN = "dimensions-chosen"
