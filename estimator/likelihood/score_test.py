@@ -30,8 +30,11 @@ from estimator.likelihood.factor_analysis import Maximum
 from estimator.records import dataclass
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
-MAX_BINS = 4
-"""Number of frequencies of a band for the information, which changes little between them."""
+ELEMENTS = 25_000
+"""Of the information on a band: its frequencies times channels times pairs. Of four frequencies, 9
+channels of 25 averages name shared noise that is not there twice as often as stated."""
+FEWEST = 4
+"""Frequencies of a band for the information, however many channels there are."""
 RESOLVED = 0.05
 """Maximum scatter of the directions of the motion for normal scores."""
 TESTABLE = 2e-3
@@ -184,7 +187,8 @@ def pair_scores(
     i, j = pairs.T
     projector = maximum.take(rows).projector
     score = 2 * (maximum.rest[rows] - projector).real.sum(axis=0)[i, j]
-    projector = projector[:: -(-len(rows) // MAX_BINS)]
+    n_bins = max(FEWEST, ELEMENTS // (p * len(pairs)))
+    projector = projector[:: -(-len(rows) // n_bins)]
     left = fisher.covariance(np.abs(projector) ** 2)
     known = np.isfinite(left).all(axis=(1, 2)) & np.isfinite(projector).all(axis=(1, 2))
     left, projector = left[known], projector[known]
