@@ -16,7 +16,7 @@ from daq.devices.guralp import scream
 from daq.devices.guralp.gcf import SampleBlock, SystemId
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, NotConnectedError, WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Event
+from daq.protocols.block import Block, Event
 from sim_devices.devices import guralp
 from sim_devices.devices.interface import DeviceSpec, Source
 from sim_devices.errors import ScenarioError
@@ -62,23 +62,6 @@ def sensor(running: tuple[RunningDevice, ...], index: int, **changes: Any) -> Se
 
 async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]:
     return await reading.record(DRIVER, one, n_samples, speed=SPEED)
-
-
-@pytest.mark.parametrize("index", range(4))
-async def test_every_link_delivers_the_samples_of_the_sensor(
-    running: tuple[RunningDevice, ...], index: int
-) -> None:
-    blocks, events = await record(sensor(running, index), 1200)
-    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
-    assert blocks[0].flags == BlockFlag.DEVICE_UTC | BlockFlag.CLOCK_RESTART
-    assert {b.flags for b in blocks[1:]} == {BlockFlag.DEVICE_UTC}
-    assert all((b.device_counter or 0) % 1_000_000_000 == 0 for b in blocks)
-    assert np.ptp([(b.device_counter or 0) - b.first_sample * 5_000_000 for b in blocks]) == 0
-    counts = np.concatenate([b.counts for b in blocks])
-    assert counts.dtype == np.int32
-    assert counts.std(axis=0) == pytest.approx(np.full(3, COUNTS * 1e-2 * 0.9), rel=0.3)
-    assert {e.kind for e in events} <= {"status"}
-    assert any("GPS" in e.text for e in events)
 
 
 async def test_streams_have_the_same_motion_at_their_stated_utc(

@@ -85,28 +85,6 @@ async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]
     return await reading.record(DRIVER, one, n_samples, speed=SPEED)
 
 
-@pytest.mark.parametrize(("index", "dtype"), [(0, np.int32), (1, np.int32), (2, float), (3, float)])
-async def test_every_format_delivers_every_sample(
-    running: tuple[RunningDevice, ...], index: int, dtype: type
-) -> None:
-    n = 4 if index == 2 else 400
-    one = sensor(running, index)
-    blocks, events = await record(one, n)
-    assert not events
-    assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
-    assert blocks[0].flags == BlockFlag.CLOCK_RESTART
-    assert {b.flags for b in blocks[1:]} <= {BlockFlag.NONE}
-    counts = np.concatenate([b.counts for b in blocks])[:n]
-    assert counts.dtype == DRIVER.counts_dtype(one) == dtype
-    assert counts.shape == (n, len(one.channels))
-    if index == 0:  # what was sent is what the sensor felt
-        world = scenario("ABCD", sampling_rate=RATE).to_dict()
-        world["motion"]["bandwidth"] = 40.0
-        truth = World(type(scenario("A")).from_dict(world)).samples("A", 0, 12_000) * COUNTS
-        start = int(np.abs(truth - counts[0]).max(axis=1).argmin())
-        assert np.abs(truth[start : start + n] - counts).max() <= 0.5
-
-
 async def test_another_device_on_the_same_port_is_ignored(
     running: tuple[RunningDevice, ...],
 ) -> None:
