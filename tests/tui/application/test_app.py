@@ -32,7 +32,7 @@ from tests.tui.example_snapshot import (
     waiting_now,
 )
 from tui.application.app import HuddleApp
-from tui.application.messages import ErrorReported, RecordingOpened, SnapshotReady, StatusUpdated
+from tui.application.messages import RecordingOpened, SnapshotReady, StatusUpdated
 from tui.application.state import BENCH
 from tui.application.test_view.view import TestView
 
@@ -163,14 +163,6 @@ async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> N
             assert view(app).choice.methods == methods
 
 
-async def test_trouble_is_told(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
-        await shown(pilot, app, ErrorReported("sensor B at /dev/ttyUSB1: no answer"))
-        text = screen_text(app)
-    assert "no answer" in text
-    assert "ErrorReported" not in text  # words for people, not names of classes
-
-
 async def test_the_result_comes_by_itself_and_its_report_on_request(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
@@ -283,25 +275,6 @@ async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) 
         text = screen_text(app)
     assert "40 of 199 values at or below zero" in text
     assert "▾" in text.replace("(▾ marks", "")
-
-
-async def test_without_colours_everything_is_there(
-    told: ProgressCallback, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("NO_COLOR", "1")
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
-        text = screen_text(app)
-        await pressed(pilot, app, "c")
-        assert "clock drift" in screen_text(app)
-    for said in (
-        "● live",
-        "○ silent",
-        "no effect on noise",
-        "▲ C has been silent",
-        "three-channel",
-    ):
-        assert said in text
 
 
 async def test_the_worst_is_told_first_and_how_much_more_there_is(told: ProgressCallback) -> None:

@@ -176,15 +176,7 @@ def test_limits_and_noise_models_are_curves() -> None:
     assert np.nanmax(np.abs(level - 20 * np.log10(0.5 * 9.80665e-6))) < 1e-9
 
 
-async def test_noise_models_are_named_in_the_key(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told, models=masks_named("nhnm,nlnm")), size=WIDE) as (app, pilot):
-        await shown(pilot, app, *running())
-        screen = screen_text(app)
-    assert "NHNM" in screen
-    assert "NLNM" in screen
-
-
-@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
+@pytest.mark.parametrize("size", [NARROW, (200, 60)])
 async def test_estimates_are_steps_with_whiskers_and_bins_by_a_key(
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
@@ -217,7 +209,7 @@ async def test_limits_are_drawn_apart_and_named_on_their_lines(told: ProgressCal
         for name, psd in (("data sheet", 7e-12), ("order 17", 7e-12))
     )
     told.bench = demo_bench().model_copy(update={"limits": limits})
-    for size in (NARROW, (120, 36), (200, 60)):
+    for size in (NARROW, (200, 60)):
         async with opened(HuddleApp(told), size=size) as (app, pilot):
             await shown(pilot, app, *running())
             found = curves(app.state, Choice(methods=("three-sensor",)), n_points=60)

@@ -134,12 +134,11 @@ def test_csv_and_json_are_those_of_the_commands(tmp_path: Path) -> None:
     assert (said["simulated"], said["recordings"]) == ("false", "[]")
 
 
-@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
 async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
-    told: ProgressCallback, size: tuple[int, int]
+    told: ProgressCallback,
 ) -> None:
     line = "A S4254475: +0.7 ± 0.2 dB since 25 October, 3 tests (1–20 Hz)"
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *ended())
         app.state = replace(app.state, path=told.path)
         await shown(pilot, app, SensorsNoted(told.path.with_name("other.h5"), ("of another",)))

@@ -60,9 +60,9 @@ async def opened(pilot: Pilot[None], app: HuddleApp, path: Path) -> SignalView:
     return shown_view(app)
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return record(tmp_path / "night.h5")
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("signal") / "night.h5")
 
 
 @pytest.mark.parametrize("name", SIZES)

@@ -74,11 +74,8 @@ async def test_starting_over_a_result_is_asked_first(
     assert told.told == ["start"]
 
 
-@pytest.mark.parametrize("size", [NARROW, WIDE])
-async def test_why_no_recording_started_stays_on_the_screen(
-    tmp_path: Path, size: tuple[int, int]
-) -> None:
-    async with opened(HuddleApp(Refusing(tmp_path / "run.h5")), size=size) as (app, pilot):
+async def test_why_no_recording_started_stays_on_the_screen(tmp_path: Path) -> None:
+    async with opened(HuddleApp(Refusing(tmp_path / "run.h5")), size=NARROW) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.press("s", "enter")
         await settled(pilot, app)
@@ -89,12 +86,11 @@ async def test_why_no_recording_started_stays_on_the_screen(
         assert "connecting" not in text
 
 
-@pytest.mark.parametrize("size", [NARROW, (120, 36), WIDE])
 async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_confirmed(
-    told: ProgressCallback, size: tuple[int, int]
+    told: ProgressCallback,
 ) -> None:
     told.wrong = ("B.X reads 0.102 of A and C (g in place of m/s²)", "C.Z is reversed")
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         for answer in ("escape", "y"):
             await pilot.press("s", "enter")
             await settled(pilot, app)

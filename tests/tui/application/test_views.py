@@ -12,7 +12,7 @@ from tests.tui.application.test_recordings import entries
 from tests.tui.example_snapshot import ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp
-from tui.application.messages import CatalogueRead, SnapshotReady
+from tui.application.messages import CatalogueRead
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
 
 
@@ -62,11 +62,10 @@ async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCa
         assert "530 segments" in screen_text(app)
 
 
-@pytest.mark.parametrize("size", [NARROW, (120, 36), (200, 60)])
 async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
-    told: ProgressCallback, size: tuple[int, int]
+    told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
         commands = {each.title: each for each in app.get_system_commands(app.screen)}
         tasks = {"Stop the test", "Show how the clocks drift", "Add a sensor"}
@@ -90,17 +89,6 @@ async def test_the_top_line_keeps_what_matters_when_it_is_narrow(
         line = screen_text(app).splitlines()[0]
         assert "● recording  1:40" in line
         assert sum(f" {n} {TITLES[name]}" in line for n, name in enumerate(VIEWS, start=1)) == named
-
-
-async def test_the_verdict_is_that_of_the_latest_snapshot(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        first, second = running(), running(n_effective=500)
-        await shown(pilot, app, *first)
-        assert app.state.result is not None
-        assert app.state.result.verdict is None  # no limits
-        await shown(pilot, app, *second)
-        assert isinstance(second[1], SnapshotReady)
-        assert app.snapshot is second[1].result.snapshot
 
 
 @pytest.mark.parametrize(("name", "size"), [("small", (40, 12)), ("middle", (120, 36))])
