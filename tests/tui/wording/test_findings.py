@@ -21,14 +21,6 @@ from tests.tui.wording.advice_examples import (
 from tests.tui.wording.fact_examples import kinds
 
 
-@pytest.mark.parametrize("advice", EXAMPLES)
-def test_advice_is_in_sentences(advice: Advice) -> None:
-    text = str(advice.words(names("a", "b", "c")))
-    assert text[0] == text[0].upper() or text[1] == "."  # or the name of a channel
-    assert text.endswith(".")
-    assert "  " not in text
-
-
 def test_every_kind_has_words() -> None:
     assert {type(advice) for advice in EXAMPLES} == kinds(Advice)
 
