@@ -273,7 +273,7 @@ class HuddleApp(FollowingApp):
         self.notify("writing the report …", timeout=3)
         self._report(path, result, is_opened=is_opened)
 
-    @work(thread=True, group="control")
+    @work(thread=True, group="control", description="a report is written")
     def _report(self, path: Path, result: Result, *, is_opened: bool) -> None:
         with self._reading:
             report = self._try(lambda: self._controls.report(path, result))
@@ -302,7 +302,7 @@ class HuddleApp(FollowingApp):
         usual = {"by": self._authority} if self._authority else {}
         self.push_screen(IssueForm(path.name, self._asked_of.get(path, usual)), issue)
 
-    @work(thread=True, group="control")
+    @work(thread=True, group="control", description="a certificate is issued")
     def _issue(self, path: Path, result: Result, wanted: Mapping[str, str]) -> None:
         try:
             with self._reading:
@@ -336,7 +336,7 @@ class HuddleApp(FollowingApp):
             picture = self.export_screenshot(title=self.path.name)
             self._save(self.path, picture, self.state.result)
 
-    @work(thread=True, group="control")
+    @work(thread=True, group="control", description="the result is saved")
     def _save(self, path: Path, picture: str, result: Result) -> None:
         files = self._try(partial(self._controls.save, path, result))
         if files is None:

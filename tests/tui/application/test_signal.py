@@ -6,12 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from textual.app import App
 from textual.pilot import Pilot
 
+from daq.estimation.snapshot import Snapshot
 from daq.recording.reader import Recording
 from daq.results.signal import Signal
 from estimator.spectra.segment_rejection import Reason
@@ -81,8 +83,9 @@ async def test_pictures(path: Path, name: str) -> None:
             assert "01:00:10" in screen_text(app)
 
 
-async def test_keys_look_closer_and_go_along(path: Path) -> None:
-    """A zoom is about the cursor; escape shows all."""
+async def test_keys_look_closer_and_go_along(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A zoom is about the cursor; escape shows all; no key prints arrays to describe a worker."""
+    monkeypatch.setattr(Snapshot, "__repr__", printed := Mock(return_value=""))
     app = HuddleApp(ProgressCallback(path))
     async with app.run_test(size=SIZES["narrow"]) as pilot:
         view = await opened(pilot, app, path)
@@ -98,6 +101,7 @@ async def test_keys_look_closer_and_go_along(path: Path) -> None:
         assert view.look.channel == 2
         await pilot.press("escape")
         assert view.look == Look(channel=2)
+    assert not printed.called
 
 
 async def test_the_next_mark_is_read_off(path: Path) -> None:

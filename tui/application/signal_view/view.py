@@ -203,7 +203,8 @@ class SignalView(View):
         self._key, self._is_busy = key, True
         self._make(self._path, look, snapshot, is_growing=not now.closed)
 
-    @work(thread=True, group="signal")
+    # Textual would print all arrays of an argument where a worker has no description.
+    @work(thread=True, group="signal", description="the signal is drawn")
     def _make(self, path: Path, look: Look, snapshot: Snapshot | None, *, is_growing: bool) -> None:
         made = SignalDrawn(path, look)
         try:
