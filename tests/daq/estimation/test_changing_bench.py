@@ -19,7 +19,7 @@ from daq.results.result import Result
 from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges
 from tests.acceptance.broken_assumptions import one
 
-RATE = 40.0
+RATE = 20.0
 N = round(1200 * RATE)
 NOISE = 2 / RATE  # PSD of white noise of variance 1
 
@@ -45,7 +45,7 @@ def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, 
         elif name == "B" and kind == "settles":
             felt[later] = felt[later] @ Rotation.from_rotvec([0, 0, np.radians(0.05)]).as_matrix()
         elif name == "B" and kind == "jitter":  # in steps of 4 s
-            felt *= 1 + 0.02 * rng.standard_normal((n // 160, 1)).repeat(160, axis=0)
+            felt *= 1 + 0.02 * rng.standard_normal((n // 80, 1)).repeat(80, axis=0)
         elif kind == "temperature":
             felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
         samples[name] = felt + rng.standard_normal((n, 3))
@@ -66,7 +66,7 @@ def estimated(
     ("kind", "ratio", "size", "words"),
     [
         ("step", 1e4, -0.05, ("The gain of B.1 fell by", " at 4")),
-        ("ramp", 1e4, 0.03, ("The gain of B rose by 3", "from 0 s to")),
+        ("ramp", 1e4, 0.03, ("The gain of B rose by 2.9", "from 0 s to")),
         ("settles", 1e6, np.radians(0.05), ("Sensor B turned by 0.0", " at 4")),
     ],
 )
@@ -85,7 +85,7 @@ def test_a_response_that_changes_is_named_sized_and_dated(
     assert not any(isinstance(each, NoiseChanges) for each in found)
     # The interval holds the expected noise, of which the estimate is far off.
     noise = snapshot.results["three-sensor"]
-    inside = slice(5, 90)
+    inside = slice(5, 45)
     own = slice(3, 6)
     low, high = noise.low[inside, own], noise.high[inside, own]
     assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
@@ -95,10 +95,10 @@ def test_a_response_that_changes_is_named_sized_and_dated(
 def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float) -> None:
     """Over all parts, motion 60 dB above the noise leaves up to 28 dB in it."""
     snapshot = estimated(kind, 1, ratio=1e6)
-    found = Result(snapshot, Settings()).spectrum("three-sensor").levels(np.array([5, 20, 45, 90]))
+    found = Result(snapshot, Settings()).spectrum("three-sensor").levels(np.array([5, 15, 30, 45]))
     assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
     noise = snapshot.results["three-sensor"]
-    inside = slice(5, 90)
+    inside = slice(5, 45)
     assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
     assert snapshot.n_effective < 420  # of 455: every part has spent three
 
@@ -110,7 +110,7 @@ def test_a_gain_that_changes_from_segment_to_segment_bounds_its_noise(ratio: flo
     (change,) = [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
     assert change.sensors == (1,)
     assert 0.01 < change.size < 0.02  # of segments of 5 s, weighted by the window
-    noise, inside = snapshot.results["three-sensor"], slice(5, 90)
+    noise, inside = snapshot.results["three-sensor"], slice(5, 45)
     low, high = noise.low[inside], noise.high[inside]
     assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
 
@@ -122,7 +122,7 @@ def test_an_estimate_that_still_grows_holds_what_a_step_adds() -> None:
         while live.update():
             pass
         noise = live.snapshot().results["three-sensor"]
-    inside = slice(5, 90)
+    inside = slice(5, 45)
     low, high = noise.low[inside], noise.high[inside]
     assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
     assert np.mean(low[:, 3] <= 0) > 0.93
@@ -136,9 +136,9 @@ def test_changes_are_found_with_every_option(option: str) -> None:
     assert change.channel == 3
     assert change.size == pytest.approx(-0.05, rel=0.1)
     noise = snapshot.results["three-sensor"]
-    inside = (snapshot.frequency > 1) & (snapshot.frequency < 18)
+    inside = (snapshot.frequency > 1) & (snapshot.frequency < 9)
     known = np.isfinite(noise.noise_psd) & inside[:, None]
-    assert known.sum() > 500
+    assert known.sum() > 250
     assert np.mean(((noise.low <= NOISE) & (noise.high >= NOISE))[known]) > 0.93
 
 
@@ -152,7 +152,7 @@ def test_gains_that_follow_one_temperature_are_found() -> None:
     snapshot = estimated("temperature", 2)
     found = snapshot.diagnostics.advice
     assert any(isinstance(each, ResponseChanges) for each in found)
-    noise, inside = snapshot.results["three-sensor"], slice(5, 90)
+    noise, inside = snapshot.results["three-sensor"], slice(5, 45)
     assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
 
 
@@ -173,7 +173,7 @@ def test_bursts_of_motion_among_weaker_motion_than_noise_are_no_change() -> None
     for seed in range(3):
         rng = np.random.default_rng(seed)
         motion = 0.2 * rng.standard_normal((N, 1))
-        motion[N // 3 : N // 3 + 2000] *= 100
+        motion[N // 3 : N // 3 + 1000] *= 100
         samples = {
             name: motion + own * rng.standard_normal((N, 1))
             for name, own in zip("ABC", (1.0, 0.5, 2.0), strict=True)
@@ -219,8 +219,8 @@ def test_a_gain_that_drifts_is_in_the_uncertainty_of_the_calibration() -> None:
 @pytest.mark.parametrize(("segment", "is_tested"), [("30s", False), ("0.5s", True)])
 def test_too_few_averages_to_test_for_changes_are_a_fact(segment: str, *, is_tested: bool) -> None:
     rng = np.random.default_rng(8)
-    motion = 30 * rng.standard_normal((6000, 1))
-    samples = {name: motion + rng.standard_normal((6000, 1)) for name in "ABC"}
+    motion = 30 * rng.standard_normal((3000, 1))
+    samples = {name: motion + rng.standard_normal((3000, 1)) for name in "ABC"}
     found = huddle.self_noise(samples, fs=RATE, segment=segment)
     names = [each.name for each in found.result.facts]
     assert ("steadiness-not-tested" not in names) == is_tested

@@ -125,12 +125,14 @@ def coloured(kind: str, rng: np.random.Generator) -> ComplexArray:
     return path / (np.linalg.norm(path) / np.sqrt(3 * N_BINS) if kind == TURNING else 1)
 
 
-@pytest.mark.parametrize("sensors", [3, 5])
 @pytest.mark.parametrize(
-    ("kind", "ratio"),
-    [(TURNING, 1.0), (TURNING, 3.0), (TURNING, 10.0), (STEEP, 1.0), (STEP, 3.0), (LINES, 1.0)],
+    ("kind", "ratio", "sensors"),
+    [
+        *((TURNING, 1.0, 3), (TURNING, 3.0, 3), (TURNING, 3.0, 5), (TURNING, 10.0, 3)),
+        *((STEEP, 1.0, 3), (STEEP, 1.0, 5), (STEP, 3.0, 3), (LINES, 1.0, 3), (LINES, 1.0, 5)),
+    ],
 )
-def test_motion_that_differs_between_bins_is_removed(sensors: int, kind: str, ratio: float) -> None:
+def test_motion_that_differs_between_bins_is_removed(kind: str, ratio: float, sensors: int) -> None:
     """Where a bin lacks a direction, neither its noise is taken off, nor is motion left in."""
     scores: list[FloatArray] = []
     held: list[FloatArray] = []
@@ -158,7 +160,7 @@ def test_motion_that_differs_between_bins_is_removed(sensors: int, kind: str, ra
 
 
 @pytest.mark.parametrize("sensors", [3, 5])
-@pytest.mark.parametrize("powers", [(1.0, 1.0, 1.0), (10.0, 10.0, 10.0), (1e5, 1e3, 10.0)])
+@pytest.mark.parametrize("powers", [(1.0, 1.0, 1.0), (1e5, 1e3, 10.0)])
 @pytest.mark.parametrize("kind", ["resonance", "notch", "line"])
 def test_what_differs_in_a_few_bins_of_one_sensor(
     kind: str, powers: tuple[float, float, float], sensors: int

@@ -127,7 +127,7 @@ def test_intervals_hold_the_noise(d: int, snr: float) -> None:
 def test_steady_motion_is_refused() -> None:
     for d in (1, 3):
         for snr in (0.3, 30.0):
-            for bench in benches(5, d=d, snr=snr):
+            for bench in benches(5, draws=20, d=d, snr=snr):
                 found = bench.estimate(bench.parts(np.zeros(N_PARTS)))
                 assert set(found.refusal) <= {Refusal.STEADY, Refusal.UNSETTLED}
                 assert np.isnan(found.level).all()
@@ -161,7 +161,7 @@ def test_noise_that_two_of_three_sensors_share_is_told_from_motion() -> None:
 def test_gains_that_follow_the_loudness_are_inside_the_interval_or_seen() -> None:
     for d, size in ((1, 0.001), (3, 0.001)):
         inside = []
-        for bench in benches(11, d=d, snr=30):
+        for bench in benches(11, draws=20, d=d, snr=30):
             level = changing(bench)
             found = bench.estimate(bench.parts(level, gain=1 + size * level / 10))
             inside.append(holds(found, bench)[found.identified])

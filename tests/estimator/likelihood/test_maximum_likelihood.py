@@ -213,15 +213,14 @@ GEOMETRIES = {
         (2,) * 3,
     ),
     **{
-        f"{name} {ratio:g}x noisier": (
+        f"{name} 100x noisier": (
             common_motion(planar_sensors(10), noise_psd, snr=1e3),
             noise_psd,
             (2,) * 3,
         )
-        for ratio in (10.0, 100.0)
         for name, noise_psd in (
-            ("two", np.array([1, 1, ratio, ratio, ratio, ratio])),
-            ("one", np.array([1, 1, 1, 1, ratio, ratio])),
+            ("two", np.array([1.0, 1, 100, 100, 100, 100])),
+            ("one", np.array([1.0, 1, 1, 1, 100, 100])),
         )
     },
     "five triaxial": (equal_noise(12, dims=(3,) * 5, snr=1e3), np.ones(15), (3,) * 5),
@@ -335,7 +334,7 @@ def test_a_missing_dimension_does_not_remove_noise() -> None:
     rng = np.random.default_rng(28)
     directions = np.concatenate([rotation(rng, 3) for _ in range(3)])[:, :2]
     csm = (1e3 * directions @ directions.T + np.eye(9)).astype(np.complex128)
-    for n, n_draws, bias in ((20, 200, 0.07), (1080, 150, 0.04)):
+    for n, n_draws, bias in ((20, 100, 0.07), (1080, 80, 0.04)):
         draws = wishart(csm, n, rng, n_draws=n_draws)
         found = maximum_likelihood(draws, dims=(3, 3, 3), n_effective=n)
         raw = maximum_likelihood(draws, dims=(3, 3, 3), n_effective=n, correct=False)

@@ -14,7 +14,7 @@ from estimator.checks.advice_on_noise import SharedNoise
 from estimator.likelihood.dimension import choose_dimension
 from tests.estimator.csm_models import wishart
 
-RATE, SECONDS = 100.0, 120.0
+RATE, SECONDS = 50.0, 120.0
 UNIT = 2 / RATE
 """PSD of noise of variance 1."""
 AMPLITUDES = np.array([[4.0, 2.0, 0.0], [0.0, 4.0, 2.0]])
@@ -38,7 +38,10 @@ def recorded(
     return samples
 
 
-@pytest.mark.parametrize(("n_sensors", "d", "ratio"), [(8, 3, 0.1), (4, 3, 10.0), (6, 1, 0.1)])
+@pytest.mark.parametrize(
+    ("n_sensors", "d", "ratio"),
+    [(8, 3, 0.1), pytest.param(4, 3, 10.0, marks=pytest.mark.long), (6, 1, 0.1)],
+)
 def test_noise_of_two_sensors_is_left_in_both_and_in_their_intervals(
     n_sensors: int, d: int, ratio: float
 ) -> None:
@@ -51,7 +54,7 @@ def test_noise_of_two_sensors_is_left_in_both_and_in_their_intervals(
     assert named.sensors == ("A", "B")
     assert named.part > 0.8
     truth = UNIT * (1 + np.square(AMPLITUDES[:, :d] if d > 1 else AMPLITUDES[[0, 0], :1])).ravel()
-    for noise, true in zip(result.means(result.method, (10.0, 30.0)), truth, strict=False):
+    for noise, true in zip(result.means(result.method, (5.0, 15.0)), truth, strict=False):
         assert noise.mean[0] == pytest.approx(true, rel=0.12)
         assert noise.low[0] <= true <= noise.high[0] * 1.05
         if true > 4 * UNIT:
@@ -66,7 +69,7 @@ def test_noise_of_two_of_three_sensors_is_in_the_intervals_of_all(ratio: float, 
     result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
     assert said in " ".join(str(each.words) for each in result.facts)
     truth = UNIT * (1 + np.square([*AMPLITUDES, np.zeros(3)])).ravel()
-    for band in ((2.0, 10.0), (10.0, 30.0)):
+    for band in ((2.0, 5.0), (5.0, 15.0)):
         means = result.means(result.method, band)
         for noise, true in zip(means, truth, strict=True):
             assert noise.low[0] <= true <= noise.high[0]
@@ -78,7 +81,7 @@ def test_two_of_four_channels_are_never_named_without_the_other_two(ratio: float
     settings = Settings(segment=2.0, methods=("auto",))
     samples = recorded(4, 1, ratio, np.random.default_rng([46, 4]))
     result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
-    for noise, true in zip(result.means(result.method, (2.0, 40.0)), (17, 17, 1, 1), strict=True):
+    for noise, true in zip(result.means(result.method, (2.0, 20.0)), (17, 17, 1, 1), strict=True):
         assert noise.low[0] <= true * UNIT <= noise.high[0]
     advice = [each for each in result.snapshot.diagnostics.advice if isinstance(each, SharedNoise)]
     named = {pair for each in advice for pair in (*each.channels, *each.alternatives)}
