@@ -67,17 +67,13 @@ def imported(folder: Path, sensors: dict[str, FloatArray]) -> Path:
             marks=pytest.mark.long,
         ),
         (
-            {"segment": "4s", "window": "kaiser,8", "overlap": 0.6, "reject": True},
-            ("--segment", "4s", "--window", "kaiser,8", "--overlap", "0.6", "--reject"),
+            {"segment": 4, "window": "kaiser,8", "overlap": 0.6, "gains": {"B": 1.02}},
+            ("--segment", "4", "--window", "kaiser,8", "--overlap", "0.6", "--gain", "B=1.02"),
         ),
         pytest.param(
             {"octaves": True, "segment": "1s", "detrend": "linear", "correct": False},
             ("--octaves", "--segment", "1s", "--detrend", "linear", "--no-correction"),
             marks=pytest.mark.long,
-        ),
-        (
-            {"gains": {"B": 1.02}, "segment": 2},
-            ("--gain", "B=1.02", "--segment", "2"),
         ),
     ],
 )
