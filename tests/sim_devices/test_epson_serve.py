@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 
 from daq.bench.model import Sensor
-from daq.devices.epson import commands
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, Reading
+from daq.protocols.block import Block, Reading
 from daq.transport.ports import open_port
 from sim_devices.errors import ServeError
 from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
-from sim_devices.world.world import World
-from tests.devices import device_at, host_clock, paced_clock, serving
+from tests.devices import device_at, host_clock, serving
 from tests.sim_devices.simulated_bench import AXES, device, scenario, sensors, spec
 from tests.tcp import served
 
@@ -51,39 +49,6 @@ async def blocks(sensor: Sensor, n_samples: int) -> list[Block]:
             if item.end_sample >= n_samples:
                 break
     return found
-
-
-async def test_the_devices_information_is_reported(running: tuple[RunningDevice, ...]) -> None:
-    (sensor,) = sensors(running[2], TABLES[2], model="M-A352")
-    async with DRIVER.open([sensor], host_clock(SPEED)) as session:
-        (information,) = session.information
-    assert information.model == "A352AD10"
-    assert information.serial_number == "C0000007"
-    assert information.sampling_rate == 200.0
-    assert information.temperature == pytest.approx(25.0, abs=0.6)
-
-
-async def test_three_devices_record_one_motion_without_gaps(
-    running: tuple[RunningDevice, ...],
-) -> None:
-    n = 1000
-    # world time, and with it the index of a sample, from before anything was started
-    before = int((paced_clock().now_ns() - SPEC["epoch_ns"]) * 1e-9 * SPEED * 200)
-    found = await asyncio.gather(
-        *(blocks(sensors(one, t)[0], n) for one, t in zip(running, TABLES, strict=True))
-    )
-    for some in found:
-        assert some[0].flags == BlockFlag.CLOCK_RESTART
-        ends = [0] + [block.end_sample for block in some]
-        assert [block.first_sample for block in some] == ends[:-1]  # COUNT of C wraps on the way
-    world = World(scenario("ABC"))
-    for name, some in zip("ABC", found, strict=True):
-        counts = np.concatenate([block.counts for block in some])[:n]
-        # when exactly the device was started shows by the motion itself
-        truth = world.samples(name, before, 50 * 200) * commands.COUNTS_PER_UNIT
-        start = int(np.argmin(np.abs(truth - counts[0, :3]).max(axis=1)))
-        assert np.abs(truth[start : start + n] - counts[:, :3]).max() <= 0.5
-        assert np.all(np.abs(counts[:, 3] - 2634) < 140)
 
 
 async def test_a_device_is_left_idle_and_found_if_streaming(

@@ -98,15 +98,6 @@ async def test_two_slaves_on_one_bus_are_recorded_at_their_instants(
     assert len({tuple(b[0].counts[0]) for b in found.values()}) == 2  # not the same slave twice
 
 
-async def test_floats_over_tcp_are_recorded(running: tuple[RunningDevice, ...]) -> None:
-    chosen = sensors(running[1], TABLES[1], settings={"preset": "labjack-ain"})
-    found = await read(chosen, 40, host_clock(SPEED))
-    counts = np.concatenate([block.counts for block in found["C"]])
-    assert counts.dtype == np.float32
-    assert 1e-3 < counts.std() < 1.0  # a white motion of 1e-6 (m/s²)²/Hz below 22.5 Hz
-    assert all(block.instants_ns is not None for block in found["C"])
-
-
 async def test_registers_with_gaps_are_read_separately() -> None:
     """A device refuses a request for registers it does not have."""
     settings = {

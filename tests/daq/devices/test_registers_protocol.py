@@ -132,11 +132,8 @@ def test_encoded_registers_are_decoded_equally(
 @pytest.mark.parametrize(
     ("given_settings", "message"),
     [
-        ({}, "address: is missing"),
         ({"addresses": (1, 2)}, "2 given; expected 3"),
-        ({"address": 65531, "data_type": "int32"}, "up to 65536; expected at most 65535"),
         ({"address": 0, "counter_address": 65536}, "up to 65536; expected at most 65535"),
-        ({"address": 0, "time_format": "uint32-s"}, "expected with time_address only"),
     ],
 )
 def test_impossible_maps_are_refused(given_settings: dict[str, Any], message: str) -> None:

@@ -188,20 +188,6 @@ async def test_a_device_is_started_and_stopped_by_its_commands(
     assert (await record(sensor(running, 2), 2))[0]
 
 
-@pytest.mark.parametrize(
-    ("index", "settings", "said"),
-    [
-        (1, {"columns": [1, 2]}, r"settings.columns = \[1, 2\]: expected one for each of the"),
-        (0, {"channel_names": ["EHZ"]}, r'channel_names = \["EHZ"\]: expected one for each'),
-    ],
-)
-async def test_formats_that_do_not_match_are_refused(
-    running: tuple[RunningDevice, ...], index: int, settings: dict[str, Any], said: str
-) -> None:
-    with pytest.raises(BenchFileError, match=said):
-        await record(sensor(running, index, settings=settings), 1)
-
-
 FAULTS = [
     {"kind": "duplicate", "at": 6.0, "every": 0.7, "count": 2},
     {"kind": "drop", "at": 6.3, "every": 1.1, "count": 3},

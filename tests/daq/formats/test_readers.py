@@ -51,19 +51,6 @@ def counts(n: int, seed: int = 0) -> np.ndarray[Any, Any]:
     return np.random.default_rng(seed).integers(-(2**23), 2**23, n, dtype=np.int32)
 
 
-def test_miniseed_sensor_is_network_station_location_and_times_are_exact(tmp_path: Path) -> None:
-    x, y = counts(1000, 1), counts(1000, 2)
-    path = write_mseed(
-        tmp_path / "a.mseed", [("00", "HNX", START_NS, x), ("00", "HNY", START_NS, y)]
-    )
-    (sensor,) = read_waveforms([path])
-    assert (sensor.name, sensor.channels) == ("XX.ABC.00", ("HNX", "HNY"))
-    assert sensor.sampling_rate == RATE
-    (stretch,) = sensor.stretches
-    assert stretch.start_utc_ns == START_NS
-    np.testing.assert_array_equal(stretch.counts, np.stack([x, y], axis=1))
-
-
 def test_miniseed_channels_are_absent_where_others_have_samples(tmp_path: Path) -> None:
     x, y = counts(1000, 1), counts(1000, 2)
     step = 5_000_000
@@ -92,21 +79,6 @@ def test_miniseed_channels_need_no_samples_in_common(tmp_path: Path) -> None:
     (sensor,) = read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
     assert sensor.first_samples() == [0, 2000]
     assert sensor.absent.tolist() == [[1, 0, 100], [0, 100, 200]]
-
-
-def test_miniseed_overlap_with_other_samples_is_refused(tmp_path: Path) -> None:
-    later = START_NS + 50 * 5_000_000
-    pieces = [("", "HNX", START_NS, counts(100, 1)), ("", "HNX", later, counts(100, 2))]
-    with pytest.raises(ImportFormatError, match="overlap"):
-        read_waveforms([write_mseed(tmp_path / "a.mseed", pieces)])
-
-
-def test_miniseed_what_obspy_cannot_read_is_named(tmp_path: Path) -> None:
-    pytest.importorskip("obspy", reason="ObsPy is an extra")
-    path = tmp_path / "notes.mseed"
-    path.write_bytes(b"nothing of the kind")
-    with pytest.raises(ImportFormatError, match=r"notes\.mseed"):
-        read_waveforms([path])
 
 
 class _Runs:
