@@ -298,10 +298,10 @@ async def test_the_newest_daily_copies_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert COPIES == 7
-    monkeypatch.setattr("tui.service.records.store.COPIES", 2)
+    monkeypatch.setattr("tui.service.records.store.COPIES", 1)
     place = Place(tmp_path, HOURLY.replace("0 * * * *", "0 12 * * *"))
-    await place.serve(4 * 24 * HOUR)
-    assert [path.stem for path in place.store.copies()] == ["2026-11-25", "2026-11-24"]
+    await place.serve(2 * 24 * HOUR)
+    assert [path.stem for path in place.store.copies()] == ["2026-11-23"]
 
 
 def test_an_unfinished_run_is_taken_up_and_other_recordings_are_left_alone(tmp_path: Path) -> None:

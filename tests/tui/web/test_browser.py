@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Browser, Page
 
+pytestmark = pytest.mark.usefixtures("chromium")  # no server where there is none
 PAGES = {"/": "Now", "/tests": "Tests", "/tests/night.h5": "night", "/login": "Log in"}
 DRAWN = "#chart[data-drawn]"
 

@@ -35,14 +35,18 @@ from tui.web.tests import Tests
 from tui.web.work import WAITING, LeftError, TooMuchWorkError, Work, WorkPiece, check_wanted
 
 resource = pytest.importorskip("resource", reason="limits of descriptors")
+OLD_KEY = "recordings/.cellar--b-.web-key"
 OPEN = {"/login"}
 """The addresses that need no right; nothing else is shown to who has not logged in."""
 
 
 @pytest.fixture(scope="module")
 def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Serve with secrets."""
-    with serving(bench_file(tmp_path_factory.mktemp("strangers"), SECRETS)) as found:
+    """Serve with secrets, where an earlier version left its key."""
+    folder = tmp_path_factory.mktemp("strangers")
+    bench = bench_file(folder, SECRETS)
+    (folder / OLD_KEY).write_bytes(b"x" * 32)
+    with serving(bench) as found:
         yield found
 
 
@@ -346,14 +350,11 @@ def _fuzz(server: Server, n: int) -> None:
 # ----------------------------------------------------------------------------------- visits
 
 
-def test_the_key_of_cookies_is_not_among_recordings(tmp_path: Path) -> None:
-    bench = bench_file(tmp_path, SECRETS)
-    old = tmp_path / "recordings" / ".cellar--b-.web-key"
-    old.write_bytes(b"x" * 32)
-    with serving(bench):
-        assert not old.exists()
-        (key,) = (tmp_path / "state").rglob("*.key")
-        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+def test_the_key_of_cookies_is_not_among_recordings(closed: Server) -> None:
+    folder = closed.log.parent
+    assert not (folder / OLD_KEY).exists()
+    (key,) = (folder / "state").rglob("*.key")
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
 
 
 def test_guesses_through_a_proxy_lock_out_who_guesses(tmp_path: Path) -> None:
