@@ -77,7 +77,12 @@ def test_values_as_written_in_toml_are_accepted(driver: str, settings: str) -> N
             "settings.baud_rate = 460800: expected at least 497301 for 7812 Hz of 3 channels",
         ),
         ("text", "columns = [1]", {}, r"settings.columns = \[1\]: expected one for each of the"),
-        ("text", 'channel_names = ["EHZ"]', {}, r'.*channel_names = \["EHZ"\]: expected one for'),
+        (
+            "text",
+            'layout = "channel"\nchannel_names = ["Z"]',
+            {},
+            r'.* = \["Z"\]: expected one for',
+        ),
         (
             "text",
             'delimiter = "\\n"',
