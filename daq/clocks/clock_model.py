@@ -213,6 +213,8 @@ class ClockState:
         Samples lost, or repeated, without being counted; the clock allows for them.
     settings : tuple of ClockSetting
         Steps of the stated times; the clock does not follow them.
+    uneven : float
+        By how much the instants of a polled sensor scatter about even ones, in seconds rms.
     """
 
     sensor: str
@@ -232,6 +234,7 @@ class ClockState:
     is_understood: bool = True
     slips: tuple[Uncounted, ...] = ()
     settings: tuple[ClockSetting, ...] = ()
+    uneven: float = field(default=0.0, metadata={"key": None})
 
     def relative_time(self, other: ClockState) -> RelativeTime:
         """Return how the times of this sensor are known against those of another."""

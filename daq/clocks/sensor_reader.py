@@ -105,6 +105,7 @@ def from_instants(
     ]
     covered = float((seconds[rows[1:] - 1] - seconds[first_rows]).sum())
     intervals = len(seconds) - len(first_rows)
+    steps = np.delete(np.diff(seconds), first_rows[1:] - 1)
     ppm = (intervals / covered / sampling_rate - 1) * 1e6 if covered > 0 else float("nan")
     state = ClockState(
         sensor=sensor,
@@ -115,6 +116,7 @@ def from_instants(
         wander_ppm=0.0,
         residual=0.0,
         n_epochs=len(epochs),
+        uneven=float(steps.std()) / math.sqrt(2) if len(steps) else 0.0,
     )
     return Clock(tuple(epochs), state)
 

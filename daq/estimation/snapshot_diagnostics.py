@@ -52,12 +52,15 @@ class Synchronisation:
         opposite, in unit**2/Hz; likewise.
     reference : str
         The sensor against which the motion measures clocks; empty where it does not.
+    uneven : mapping of str to float
+        Seconds rms by which the instants of polled sensors scatter, by sensor.
     """
 
     residual: Mapping[str, float] = field(default_factory=dict)
     noise_bias: FloatArray | None = None
     removed: FloatArray | None = None
     reference: str = ""
+    uneven: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_known(self) -> bool:

@@ -45,7 +45,7 @@ SENTENCES: Mapping[Problem, str] = {
     Problem.WRAPPING: "the counts of {sensor}.{channel} wrap at {value:.0f} bits: reduce the"
     " motion, choose a larger range, or correct the data type",
     Problem.REPEATS: "{sensor} repeats its values: it refreshes at {value:.3g} Hz, polled at"
-    " {wanted:g} Hz; reduce sampling_rate, or let it refresh faster",
+    " {wanted:g} Hz; let it refresh faster",
     Problem.STUCK_BIT: "{sensor}.{channel} lacks codes: {value:.1f} bits of its range are used;"
     " check the digitizer",
     Problem.NEAR_FULL_SCALE: "{sensor}.{channel} reaches {value:.0%} of its full scale: reduce the"

@@ -31,7 +31,7 @@ def facts_of(estimate: Estimate) -> list[Fact]:
         *facts_of_segments(snapshot),
         *facts_of_rounding(snapshot),
         *facts_of_linearity(snapshot),
-        *facts_of_clocks(snapshot),
+        *facts_of_clocks(estimate),
         *facts_of_model(snapshot),
         *facts_of_methods(snapshot),
         *facts_of_precision(estimate),

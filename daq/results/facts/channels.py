@@ -121,11 +121,11 @@ class ReadingsRepeat(Fact):
         (sensor,) = self.sensors
         how = f"it refreshes at {self.refresh:.3g} Hz, polled at {self.polled:g} Hz"
         return Words(
-            f"{sensor} repeats its values, so the noise is too high: poll at {self.refresh:.3g} Hz",
+            f"{sensor} repeats its values, so the noise is too high: let it refresh faster",
             f"{sensor} repeats its values: {how}. {percent(self.share)} of its rows repeat the row "
             "before, and the noise of its channels is too high.",
-            "Set its sampling_rate in the bench file to its refresh rate, or below, or let the "
-            "device refresh faster.",
+            "Let the device refresh several times as fast as it is polled. Slower polls help only "
+            "where the device filters its readings for them.",
         )
 
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
+import numpy as np
+
 from daq.clocks.clock_model import ClockSetting, ClockSource
-from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import UNCOUNTED_CHECK, Uncounted
-from daq.results.band_summary import known_range
-from daq.results.clock_effect import reference
+from daq.results.band_summary import Estimate, known_range
+from daq.results.clock_effect import NEGLIGIBLE_EFFECT, SMALL_EFFECT, effect_by_sensor, reference
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.advice_on_signals import NoSharedMotion
-from estimator.records import Seconds
+from estimator.records import Hertz, Seconds
 from estimator.wording import Words, few, listed, several, signed, time_of_day
 
 _LIKE_A_CLOCK = Delay | Gain | ModelMisfit | NoSharedMotion
@@ -29,6 +30,9 @@ _SURE = 3.0  # residuals of a clock, beyond which it drifts besides where it was
 
 
 _SETTINGS = 3  # named one by one
+
+
+_LOUD = 2.0  # times the noise of the quietest sensor that streams
 
 
 class ClocksFitted(Fact):
@@ -218,13 +222,52 @@ class ClocksMayExplain(Fact):
         )
 
 
+class Polled(Fact):
+    """A sensor is polled: uneven instants, old readings and fast motion add to its noise.
+
+    Attributes
+    ----------
+    uneven : float
+        By how much the instants scatter, s rms.
+    share : float
+        Of the noise of its worst channel in the band, that may come from that; NaN: not known.
+    above : float
+        Hz: motion above it is folded below it.
+    is_loud : bool
+        Whether its noise is more than twice that of the sensors that are not polled.
+    """
+
+    uneven: Seconds
+    share: float
+    above: Hertz
+    is_loud: bool
+
+    def _words(self) -> Words:
+        sensor = listed(self.sensors)
+        above = f"motion above {self.above:g} Hz and old readings count as its noise"
+        line = f"{sensor} is polled: {above}"
+        text = f"{line}, in no interval."
+        if self.is_loud:
+            text += f" {sensor} has more noise than sensors that stream."
+        if self.share > NEGLIGIBLE_EFFECT:
+            how = f"polled at uneven instants ({self.uneven * 1e3:.2g} ms rms)"
+            most = f"up to {self.share:.0%} of its noise"
+            line = f"{sensor} is {how}, {most}: let the host do less"
+            text += f" It is {how}: {most}, which the intervals include."
+        if self.rank is Rank.TO_KNOW:
+            return Words(line, text)
+        do = "Let the host do less, or use a device that streams."
+        return Words(line, text, f"{do} A device that is polled must refresh much faster.")
+
+
 def _us(seconds: float) -> str:
     value = seconds * 1e6
     return f"{value:.0f} µs" if value > 10 else f"{value:.1f} µs"
 
 
-def facts_of_clocks(snapshot: Snapshot) -> Iterator[Fact]:
+def facts_of_clocks(estimate: Estimate) -> Iterator[Fact]:
     """Yield how the times of samples are known, and where they are wrong or may be."""
+    snapshot = estimate.snapshot
     clocks, left = snapshot.clocks, snapshot.diagnostics.synchronisation.residual
     fitted = [clock for clock in clocks if clock.source is ClockSource.ARRIVAL_TIMES]
     if fitted:
@@ -274,6 +317,7 @@ def facts_of_clocks(snapshot: Snapshot) -> Iterator[Fact]:
                 ppm=clock.ppm,
                 error=clock.residual,
             )
+    yield from _polled(estimate)
     if nominal := tuple(clock.sensor for clock in clocks if math.isnan(clock.residual)):
         yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
     if any(isinstance(each, _LIKE_A_CLOCK) for each in snapshot.diagnostics.advice):
@@ -282,4 +326,31 @@ def facts_of_clocks(snapshot: Snapshot) -> Iterator[Fact]:
         if loose:
             yield ClocksMayExplain(
                 rank=Rank.DELAYS, sensors=tuple(loose), error=max(loose.values())
+            )
+
+
+def _polled(estimate: Estimate) -> Iterator[Polled]:
+    """Yield the polled sensors that have an estimate."""
+    snapshot, found = estimate.snapshot, estimate.noise
+    uneven = snapshot.diagnostics.synchronisation.uneven
+    if found is None or not uneven:
+        return
+    low, high = estimate.band
+    inside = (snapshot.frequency >= low) & (snapshot.frequency <= high)
+    level = np.nan_to_num(found.noise_psd[inside]).sum(axis=0)
+    of_sensor: dict[str, float] = {}
+    for label, one in zip(snapshot.channels, level.tolist(), strict=True):
+        of_sensor[label.sensor] = max(of_sensor.get(label.sensor, 0.0), one)
+    usual = min((one for name, one in of_sensor.items() if name not in uneven), default=math.inf)
+    rates = {each.name: each.sampling_rate for each in snapshot.sensors}
+    for sensor, share in effect_by_sensor(estimate).items():
+        if sensor in uneven:
+            is_loud = of_sensor[sensor] > _LOUD * usual
+            yield Polled(
+                rank=Rank.DELAYS if is_loud or share > SMALL_EFFECT else Rank.TO_KNOW,
+                sensors=(sensor,),
+                uneven=uneven[sensor],
+                share=share,
+                above=rates[sensor] / 2,
+                is_loud=is_loud,
             )

@@ -116,11 +116,14 @@ def counts(n_samples: int, n_channels: int, seed: int) -> NDArray[np.int32]:
     return rng.integers(-10_000, 10_000, (n_samples, n_channels), dtype=np.int32)
 
 
-def write_polled(path: Path, lost: dict[str, NDArray[np.bool_]], *, rate: float = 50.0) -> Path:
+def write_polled(
+    path: Path, lost: dict[str, NDArray[np.bool_]], *, rate: float = 50.0, late: float = 1e-4
+) -> Path:
     """Write polled sensors of one motion, without the samples that are lost, by name.
 
     Every stretch between gaps comes in blocks of half a second; the first one after a gap says
-    that the number of missing samples is estimated, as the register driver does.
+    that the number of missing samples is estimated, as the register driver does. Samples are even;
+    their instants are up to `late` s after them.
     """
     rng = np.random.default_rng(4)
     motion = rng.standard_normal((len(next(iter(lost.values()))), 3))
@@ -138,7 +141,7 @@ def write_polled(path: Path, lost: dict[str, NDArray[np.bool_]], *, rate: float 
         n_samples = len(gone)
         noise = rng.standard_normal((n_samples, 3))
         samples = np.round(1e3 * (motion + 0.1 * noise)).astype(np.int16)
-        seconds = np.arange(n_samples) / rate + 1e-4 * rng.random(n_samples)
+        seconds = np.arange(n_samples) / rate + late * rng.random(n_samples)
         instants = ORIGIN.monotonic_ns + np.round(1e9 * seconds).astype(np.int64)
         edges = np.flatnonzero(np.diff(gone, prepend=True, append=True)).reshape(-1, 2)
         for low, high in edges.tolist():

@@ -25,7 +25,7 @@ from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
-from daq.results.facts.clocks import ClockSet, facts_of_clocks
+from daq.results.facts.clocks import ClockSet
 from daq.results.result import Result
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.peers.digitizer import CODES, START, Digitizer, seedlink
@@ -87,7 +87,7 @@ def test_a_result_names_when_the_clock_of_a_text_logger_was_set(
         for data, seconds in sent:
             items += receive(data, arrival(seconds))
     snapshot = estimated(tmp_path / "r.h5", items)
-    (fact,) = [each for each in facts_of_clocks(snapshot) if isinstance(each, ClockSet)]
+    (fact,) = [each for each in Result(snapshot, SETTINGS).facts if isinstance(each, ClockSet)]
     (setting,) = fact.settings
     assert fact.sensors == ("B",)
     assert setting.step == pytest.approx(size, abs=1e-3)

@@ -14,8 +14,11 @@ from daq.estimation.diagnosis import bias_of_clocks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot_diagnostics import CLOCK_FACTOR, Synchronisation
+from daq.results.facts.clocks import Polled
 from daq.results.result import Result
+from estimator.checks.advice import Rank
 from estimator.methods import self_noise
+from tests.daq.clocks.recordings import write_polled
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.results import result_table
 from tui.wording.formatting import level_with_error
@@ -125,3 +128,23 @@ def test_errors_of_two_clocks_take_nothing_from_the_noise_of_two_sensors() -> No
     assert not found.removed.any()
     assert found.noise_bias is not None
     assert (found.noise_bias[1:, 1] > 0).all()
+
+
+@pytest.mark.parametrize("late", [1e-6, 5e-3])
+def test_uneven_instants_of_polls_are_in_the_interval_at_all_frequencies(
+    tmp_path: Path, late: float
+) -> None:
+    """Devices sample evenly, 20 dB above their noise; far below the motion that adds the most."""
+    path = write_polled(
+        tmp_path / "p.h5", {each: np.zeros(15_000, np.bool_) for each in "abc"}, late=late
+    )
+    settings = Settings(segment=5.0, band=(0.5, 3.0), methods=("three-sensor",))
+    result = Result(estimate([path], settings), settings)
+    facts = [each for each in result.facts if isinstance(each, Polled)]
+    assert [each.rank for each in facts] == [Rank.DELAYS if late > 1e-4 else Rank.TO_KNOW] * 3
+    truth = 0.01 * 2 / 50
+    means = result.means("three-sensor")
+    assert sum(bool(each.low[0] < truth < each.high[0]) for each in means) >= 8
+    if late > 1e-4:
+        assert facts[0].uneven == pytest.approx(late / math.sqrt(12), rel=0.05)
+        assert np.mean([each.mean[0] for each in means]) > 1.5 * truth

@@ -38,6 +38,7 @@ from daq.results.facts.clocks import (
     ClockSet,
     ClocksFitted,
     ClocksMayExplain,
+    Polled,
     RatesNominal,
     SamplesUncounted,
     StatedTimesDrift,
@@ -218,6 +219,7 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     ClockNotUnderstood(rank=Rank.INVALIDATES, sensors=A, ppm=-985.0, error=1e-3),
     RatesNominal(rank=Rank.DELAYS, sensors=A),
+    Polled(rank=Rank.DELAYS, sensors=A, uneven=2e-3, share=0.4, above=25.0, is_loud=True),
     ClocksMayExplain(rank=Rank.DELAYS, sensors=A, error=7e-3),
     NoEstimateAbove(rank=Rank.TO_KNOW, band=(90.0, 100.0)),
     ModelUntested(
