@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from tui.commands.options import command, read_option, with_estimate_options, with_logging
+from tui.commands.options import (
+    NEW_RECORDING,
+    command,
+    read_option,
+    with_estimate_options,
+    with_logging,
+)
 from tui.output.console import for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
 from tui.page.table import Table
@@ -39,7 +45,7 @@ _ORIGINS = {
 def import_(
     sources: list[str],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o")],
+    out: Annotated[Path, NEW_RECORDING],
     bench: Path | None = None,
     response: list[Path] | None = None,
     response_for: list[str] | None = None,

@@ -127,6 +127,13 @@ def command(*, first: str = "") -> Callable[[Command], Command]:
     return keep
 
 
+def _of_a_recording(out: Path | None) -> Path | None:
+    """Raise typer.BadParameter if a name is not that of a recording."""
+    if out is not None and out.suffix.lower() not in {".h5", ".hdf5"}:
+        raise typer.BadParameter(f"{out}: expected a file name that ends in .h5")
+    return out
+
+
 def duration(value: str | float) -> float:
     """Read a duration from the command line, in seconds."""
     try:
@@ -136,6 +143,7 @@ def duration(value: str | float) -> float:
 
 
 OutOption: TypeAlias = Annotated[Path | None, typer.Option("--out", "-o")]
+NEW_RECORDING = typer.Option("--out", "-o", callback=_of_a_recording)
 DurationOption: TypeAlias = Annotated[
     float | None, typer.Option("--duration", "-d", parser=duration)
 ]

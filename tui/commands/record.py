@@ -19,7 +19,7 @@ from daq.bench.end_condition import EndCondition
 from daq.errors import HuddleError, WrongSettingError
 from daq.python_process import python_command
 from daq.recording.storage.names import recording_path
-from tui.commands.options import DurationOption, OutOption, command, with_logging
+from tui.commands.options import NEW_RECORDING, DurationOption, command, with_logging
 from tui.output.console import notices, write_json
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def record(
     check: bool = False,
     anyway: bool = False,
     wire_log: Path | None = None,
-    out: OutOption = None,
+    out: Annotated[Path | None, NEW_RECORDING] = None,
     json: str | None = None,
 ) -> None:
     """Record without estimating, until the duration has passed or Ctrl-C.

@@ -54,7 +54,7 @@ def run(
     until_cov: Annotated[float | None, typer.Option(min=0.001, max=1.0)] = None,
     until_decided: bool = False,
     anyway: bool = False,
-    out: options.OutOption = None,
+    out: Annotated[Path | None, options.NEW_RECORDING] = None,
     diagnostics: options.DetailsOption = False,
     report: Path | None = None,
     json: str | None = None,

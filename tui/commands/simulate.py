@@ -7,9 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from tui.commands.options import DurationOption, command, with_logging
+from tui.commands.options import NEW_RECORDING, DurationOption, command, with_logging
 
 
 @command()
@@ -17,7 +15,7 @@ from tui.commands.options import DurationOption, command, with_logging
 def simulate(
     scenario: str,
     *,
-    out: Annotated[Path, typer.Option("--out", "-o")],
+    out: Annotated[Path, NEW_RECORDING],
     duration: DurationOption = None,
     json: str | None = None,
 ) -> None:
@@ -45,6 +43,4 @@ def simulate(
     """
     from tui.simulation.write_recording import simulate_recording
 
-    if out.suffix.lower() not in {".h5", ".hdf5"}:
-        raise typer.BadParameter(f"{out}: expected a file name that ends in .h5")
     simulate_recording(scenario, out=out, duration=duration, json=json)

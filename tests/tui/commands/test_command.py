@@ -171,8 +171,13 @@ def test_the_manual_has_every_command() -> None:
         assert (done.stdout + done.stderr, done.returncode) == ("", 0)
 
 
-def test_a_simulation_is_not_written_under_the_name_of_another_format(tmp_path: Path) -> None:
-    refused = huddle("simulate", "fig9", "--out", str(tmp_path / "x.txt"), code=2)
+@pytest.mark.parametrize(
+    "command", ["simulate fig9", "import a.csv", "record a.toml", "run a.toml"]
+)
+def test_no_recording_is_written_under_the_name_of_another_format(
+    tmp_path: Path, command: str
+) -> None:
+    refused = huddle(*command.split(), "--out", str(tmp_path / "x.txt"), code=2)
     assert "expected a file name that ends in .h5" in " ".join(refused.stderr.split())
     assert not list(tmp_path.iterdir())
 
