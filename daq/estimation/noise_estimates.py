@@ -593,11 +593,13 @@ def noise_estimates(
                 if method == "maximum-likelihood":
                     options = [option | {"maxima": maxima} for option in options]
                 engine = chosen or method == "maximum-likelihood"
-                given: Sequence[SelfNoise | None] = known.get(method, ()) or [None] * len(bands)
+                lacks = chosen and method == "three-sensor" and _lacks_channels(bands, dims)
+                itself = () if lacks else known.get(method, ())
+                given: Sequence[SelfNoise | None] = itself or [None] * len(bands)
                 blocks = [blocks_of(band.frequencies) if engine else None for band in bands]
                 parts = [
                     self_noise(
-                        method,
+                        "maximum-likelihood" if lacks else method,
                         band.csm,
                         dims=dims,
                         n_effective=band.n_effective,
@@ -622,6 +624,14 @@ def noise_estimates(
             else:
                 results[method] = joined(parts)
     return Estimates(results, refused, dimensions, changing)
+
+
+def _lacks_channels(bands: Sequence[Band], dims: tuple[int, ...]) -> bool:
+    """Whether dead channels leave fewer than three whole sensors: maximum likelihood stands in."""
+    power = np.concatenate([np.einsum("fii->fi", each.csm).real for each in bands])
+    dead = ~(power > 0).any(axis=0)
+    whole = ~np.logical_or.reduceat(dead, np.cumsum([0, *dims[:-1]]))
+    return bool(dead.any()) and np.count_nonzero(whole & (np.array(dims) == max(dims))) < _WHOLE
 
 
 def _inflation(band: Band, stability: Stability | None) -> FloatArray:

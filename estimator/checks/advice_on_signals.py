@@ -159,15 +159,11 @@ class MissingChannels(Advice):
 
     def _words(self, names: Names) -> Words:
         whole = names.list_sensors(self.whole_sensors) if self.whole_sensors else "any sensor"
-        is_used = "maximum-likelihood" in names.in_use
-        do = "check cables" if is_used else "use --method maximum-likelihood"
+        head = f"Channels of {names.list_sensors(self.sensors)} are missing"
         return Words(
-            f"Channels of {names.list_sensors(self.sensors)} are missing: no three-sensor "
-            f"estimate; {do}",
-            f"Channels of {names.list_sensors(self.sensors)} are missing: there is no "
-            f"three-sensor estimate for {whole}, because each sensor needs two others with all "
-            "their channels. The orientations of all sensors cannot be compared.",
-            ""
-            if is_used
-            else "Maximum likelihood uses the remaining channels (--method maximum-likelihood).",
+            f"{head}: not three-sensor, but maximum likelihood can use the others; check cables",
+            f"{head}: the three-sensor method gives no estimate for {whole}, because each sensor "
+            "needs two others with all their channels. The orientations of all sensors cannot be "
+            "compared.",
+            "Check cables. Maximum likelihood, which auto takes here, uses the remaining channels.",
         )

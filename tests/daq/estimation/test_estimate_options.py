@@ -368,6 +368,10 @@ def test_a_channel_that_stands_still_is_dead_and_the_others_are_not(
         assert np.isnan(noise.noise_psd[:, 4]).all()
     others = np.delete(found.results["maximum-likelihood"].noise_psd[2:-1], 4, axis=1)
     assert np.isfinite(others).all()
+    chosen = estimate([tmp_path / "r.h5"], replace(settings, methods=("auto",)))
+    np.testing.assert_allclose(
+        np.delete(chosen.results["three-sensor"].noise_psd[2:-1], 4, axis=1), others
+    )
     worst = found.diagnostics.advice[0]
     assert isinstance(worst, NoSignal)
     assert worst.channels == (4,)
