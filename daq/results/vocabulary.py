@@ -46,6 +46,7 @@ CAUSES: Mapping[Cause, str] = {
     Cause.GRAVITY: "g in place of m/s², or the reverse",
     Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
     Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
+    Cause.CHANGED: "it changed in the test",
 }
 """What makes a sensitivity wrong by a factor."""
 

@@ -37,6 +37,8 @@ class Cause(enum.StrEnum):
     """Single-ended in place of differential, or peak to peak in place of peak."""
     GAIN_SWITCH = "gain-switch"
     """Another position of a gain switch, or another multiple of the unit."""
+    CHANGED = "changed"
+    """The sensor changed, or was carried away, in the test: no sensitivity is wrong."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,6 +88,8 @@ class WrongSensitivity(Fact):
                 "Correct the sensitivities, or give their certificates.",
             )
         text = f"{who} reads {self.gain:.3g} of {listed(self.against)}{cause}"
+        if self.cause is Cause.CHANGED:
+            return Words(f"{text}: record again", f"{text}.", "Record again.")
         do = "Correct its sensitivity, or give its certificate."
         return Words(f"{text}: correct its sensitivity", f"{text}.", do)
 

@@ -22,7 +22,9 @@ from daq.results.band_summary import (
 from daq.results.decision.facts import WrongSensitivity
 from daq.results.decision.verdict import LimitResult, TestVerdict
 from estimator.checks.advice import Rank
-from estimator.checks.sensitivities import TOLERANCE, wrong_gains
+from estimator.checks.advice_on_noise import ResponseChanges
+from estimator.checks.advice_on_signals import NoSharedMotion
+from estimator.checks.sensitivities import TOLERANCE, Cause, wrong_gains
 from estimator.decision.comparison import (
     Comparison,
     Judged,
@@ -128,9 +130,20 @@ def _named(snapshot: Snapshot, found: Iterable[WrongGain]) -> tuple[WrongSensiti
             gains=tuple(each.gain for each in group),
             standard_errors=tuple(each.error for each in group),
             against=tuple(sensors[n] for n in group[0].against),
-            cause=group[0].cause,
+            cause=Cause.CHANGED if _has_changed(snapshot, group[0]) else group[0].cause,
         )
         for group in groups
+    )
+
+
+def _has_changed(snapshot: Snapshot, wrong: WrongGain) -> bool:
+    """Whether the sensor was carried away, or its response changed by half of this or more."""
+    sensor = snapshot.sensor_names.index(snapshot.channels[wrong.channel].sensor)
+    return any(
+        isinstance(each, NoSharedMotion)
+        or (isinstance(each, ResponseChanges) and 2 * abs(each.size) >= abs(wrong.gain - 1))
+        for each in snapshot.diagnostics.advice
+        if sensor in each.sensors
     )
 
 

@@ -12,6 +12,8 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
 from daq.results.vocabulary import CAUSES
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.relative_response import relative_response
 from estimator.checks.sensitivities import Cause
 from estimator.decision.verdict import Obstacle, Verdict
@@ -102,6 +104,21 @@ def test_the_verdict_names_sensor_factor_and_cause() -> None:
     # Neither of both sensitivities passes here, or fails there: the verdict does not depend on it.
     assert verdict_of(snapshot, NOISE * 20).verdict is Verdict.PASS
     assert {each.verdict for each in verdict_of(snapshot, NOISE / 40).limits} == {Verdict.FAIL}
+
+
+def test_a_sensor_that_was_carried_away_is_not_told_to_correct_its_sensitivity() -> None:
+    snapshot = snapshot_of(np.random.default_rng(2), np.repeat([1.0, 1.0, 0.8], 3))
+    diagnosis = snapshot.diagnostics.diagnosis
+    assert diagnosis is not None
+    away = NoSharedMotion(
+        rank=Rank.INVALIDATES, sensors=(2,), partners=(0, 1), share=0.0, share_of_partners=1.0
+    )
+    diagnostics = replace(snapshot.diagnostics, diagnosis=replace(diagnosis, advice=(away,)))
+    for given in (snapshot, replace(snapshot, diagnostics=diagnostics)):
+        (wrong,) = verdict_of(given, NOISE / 1.3).sensitivities
+        assert (wrong.cause is Cause.CHANGED) == (given is not snapshot)
+        assert ("correct its sensitivity" in wrong.line) == (given is snapshot)
+    assert str(wrong).endswith("(it changed in the test). Record again.")
 
 
 def test_a_limit_failed_only_by_a_wrong_sensitivity_is_not_failed() -> None:
