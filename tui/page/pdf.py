@@ -41,7 +41,9 @@ LEAST = 0.8
 BOX = 0.42
 """Height of a box to be filled in."""
 LONGEST = 1500
-"""Characters of a cell: a row must fit on a page."""
+"""Characters of a cell."""
+HIGHEST = 0.8
+"""Height of a row over that of the page: it must fit below the header."""
 _FAMILY = "DejaVu"
 _RIGHT_TO_LEFT = re.compile("[\u0590-\u08ff\ufb1d-\ufeff]")
 """Letters whose order on paper is not that of the text."""
@@ -444,8 +446,10 @@ class _Paper(FPDF):
         text = _shown(text)
         if "\n" not in text and self.get_string_width(text) <= width:
             return [text]
-        lines: Any = self.multi_cell(width, text=text, dry_run=True, output=MethodReturnValue.LINES)
-        return [str(line).rstrip() for line in lines]
+        found: Any = self.multi_cell(width, text=text, dry_run=True, output=MethodReturnValue.LINES)
+        lines = [str(line).rstrip() for line in found]
+        most = int(HIGHEST * self.eph / self.sizes.table / self.sizes.line * 72)
+        return lines if len(lines) <= most else [*lines[: most - 1], "…"]
 
     def get_string_width(self, s: str, *_: object, **__: object) -> float:
         """Return how wide a text is; its order, right to left or not, does not change that."""

@@ -112,6 +112,22 @@ def test_a_text_of_any_length_fits_on_pages(reported: Reported) -> None:
     assert text.count("…") == 4  # each is cut, and says so
 
 
+def test_a_row_of_many_lines_ends_on_its_page() -> None:
+    many = Table(("what", "text"), (("a", "b\n" * 400), ("last", "row")), left=frozenset({0, 1}))
+    report = Report("Rows", "", Paragraph("set"), (Section("One", (many,)),))
+    below: list[float] = []
+
+    def note(text: str, _m: object, place: list[float], _f: object, _s: float) -> None:
+        below.extend([place[5]] * bool(text.strip()))
+
+    text = ""
+    for page in PdfReader(paper_of(report)).pages:
+        text += page.extract_text(visitor_text=note)
+    assert min(below) > 0
+    assert "…" in text
+    assert "row" in text
+
+
 @pytest.mark.long
 def test_one_channel_a_sensor_and_fifteen_sensors_fit(reported: Reported, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
