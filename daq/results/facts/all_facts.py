@@ -39,12 +39,19 @@ def facts_of(estimate: Estimate) -> list[Fact]:
 
 
 def ranked(facts: Iterable[Fact], estimate: Estimate) -> tuple[Fact, ...]:
-    """Return facts that concern the band asked for by their rank, the worst first; then others."""
+    """Return facts that concern the band asked for by their rank, the worst first; then others.
+
+    Of one rank, first those that concern most of the band.
+    """
     ranks, asked = list(Rank), estimate.concern
     placed = (
         replace(fact, is_outside=True) if is_outside(fact.band, asked) else fact for fact in facts
     )
-    return tuple(sorted(placed, key=lambda fact: (fact.is_outside, ranks.index(fact.rank))))
+
+    def key(fact: Fact) -> tuple[bool, int, float]:
+        return fact.is_outside, ranks.index(fact.rank), -_covered(fact.band, asked)
+
+    return tuple(sorted(placed, key=key))
 
 
 def is_outside(band: tuple[float, float] | None, asked: tuple[float, float] | None) -> bool:
@@ -52,6 +59,13 @@ def is_outside(band: tuple[float, float] | None, asked: tuple[float, float] | No
     if band is None or asked is None:
         return False
     return band[1] < asked[0] or asked[1] < band[0]
+
+
+def _covered(band: tuple[float, float] | None, asked: tuple[float, float] | None) -> float:
+    """Return the share of a band asked for that another covers; 1 where either is all."""
+    if band is None or asked is None:
+        return 1.0
+    return (min(band[1], asked[1]) - max(band[0], asked[0])) / (asked[1] - asked[0])
 
 
 def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator[Fact]:

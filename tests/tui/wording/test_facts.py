@@ -19,6 +19,7 @@ import huddle
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Bridged, Octave, Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
+from daq.results.facts.all_facts import ranked
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import MethodRefused
 from daq.results.facts.model import ModelPasses
@@ -235,6 +236,15 @@ def test_every_renderer_shows_every_kind(recorded: Path, monkeypatch: pytest.Mon
     for entry in entries:
         words = words_of[entry["kind"]]
         assert (entry["line"], entry["explanation"]) == (words.line, words.explanation)
+
+
+def test_of_one_rank_what_concerns_most_of_the_band_asked_for_stands_first() -> None:
+    bands = (2.0, 3.0), (15.0, 30.0), (5.0, 8.0), None
+    fact = next(each for each in EXAMPLES if each.rank is Rank.DELAYS)
+    facts = [replace(fact, band=band) for band in bands]
+    asked = Result(diagnosed(), replace(SETTINGS, band=(1.0, 10.0)))
+    found = [each.band for each in ranked(facts, asked)]
+    assert found == [None, (5.0, 8.0), (2.0, 3.0), (15.0, 30.0)]
 
 
 @pytest.mark.parametrize("fact", EXAMPLES, ids=lambda fact: str(fact.name))
