@@ -631,7 +631,7 @@ def _lacks_channels(bands: Sequence[Band], dims: tuple[int, ...]) -> bool:
     power = np.concatenate([np.einsum("fii->fi", each.csm).real for each in bands])
     dead = ~(power > 0).any(axis=0)
     whole = ~np.logical_or.reduceat(dead, np.cumsum([0, *dims[:-1]]))
-    return bool(dead.any()) and np.count_nonzero(whole & (np.array(dims) == max(dims))) < _WHOLE
+    return bool(dead.any() and (whole & (np.array(dims) == max(dims))).sum() < _WHOLE)
 
 
 def _inflation(band: Band, stability: Stability | None) -> FloatArray:

@@ -161,7 +161,7 @@ class MissingChannels(Advice):
         whole = names.list_sensors(self.whole_sensors) if self.whole_sensors else "any sensor"
         head = f"Channels of {names.list_sensors(self.sensors)} are missing"
         return Words(
-            f"{head}: not three-sensor, but maximum likelihood can use the others; check cables",
+            f"{head}: only maximum likelihood uses the others; check cables",
             f"{head}: the three-sensor method gives no estimate for {whole}, because each sensor "
             "needs two others with all their channels. The orientations of all sensors cannot be "
             "compared.",
