@@ -380,26 +380,27 @@ def _at_limits(name: str, counts: NDArray[np.int32]) -> NDArray[np.int32]:
 
 def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
     paths = [
-        record(tmp_path / "limits.h5", hours=0.6, device=_at_limits),
-        record(tmp_path / "fine.h5", hours=0.6, begin_ns=START_NS + 9 * HOUR_NS),
+        record(tmp_path / "limits.h5", hours=0.3, device=_at_limits),
+        record(tmp_path / "fine.h5", hours=0.3, begin_ns=START_NS + 9 * HOUR_NS),
     ]
-    store = store_for(tmp_path / "store", paths[0])
+    settings = replace(SETTINGS, segment=2.0)
+    store = store_for(tmp_path / "store", paths[0], settings)
     assert fill(store, paths) == []
-    counts = estimate(paths, SETTINGS).diagnostics.counts
+    counts = estimate(paths, settings).diagnostics.counts
     assert (list(counts.clipped), list(counts.repeated)) == ([0], [2, 3])
     assert {n: each.bits for n, each in counts.wrapped.items()} == {1: 10}
     assert {n: each.step for n, each in counts.codes.items()} == {4: 3, 5: 3}
     for _ in range(2):  # from the files, then from the index
-        pooled = answer(store, store.entries()[0], SETTINGS).pooled
+        pooled = answer(store, store.entries()[0], settings).pooled
         assert pooled.diagnostics.counts == counts
         assert pooled.diagnostics.faulty == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize("reject", [False, True])
 def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool) -> None:
-    n, third = round(0.9 * 3600 * RATE), round(0.3 * 3600 * RATE)
-    path = record(tmp_path / "r.h5", hours=0.9, absent={"B": [(1, third, 2 * third)]})
-    other = record(tmp_path / "other.h5", hours=0.9, begin_ns=START_NS + 3 * HOUR_NS, seed=2)
+    n, third = round(0.6 * 3600 * RATE), round(0.2 * 3600 * RATE)
+    path = record(tmp_path / "r.h5", hours=0.6, absent={"B": [(1, third, 2 * third)]})
+    other = record(tmp_path / "other.h5", hours=0.6, begin_ns=START_NS + 3 * HOUR_NS, seed=2)
     store = store_for(tmp_path / "store", path, replace(SETTINGS, reject=reject))
     assert fill(store, [path, other]) == []
     for entries, _ in (store.entries(), store.entries()):  # from files, and from the index
@@ -434,7 +435,7 @@ def test_a_sensor_that_shortens_recordings_is_named(tmp_path: Path) -> None:
 
 
 def test_a_recording_from_1970_is_in_the_answer(tmp_path: Path) -> None:
-    path = record(tmp_path / "first.h5", begin_ns=0, hours=0.6)
+    path = record(tmp_path / "first.h5", begin_ns=0, hours=0.3)
     store = store_for(tmp_path / "store", path)
     assert fill(store, [path]) == []
     found = answer(store, store.entries()[0], SETTINGS)

@@ -262,7 +262,7 @@ def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_
 
 
 def test_octaves_of_several_recordings_add(tmp_path: Path) -> None:
-    sensors = bench(n_samples=6000)
+    sensors = bench(n_samples=3000)
     paths = [write(tmp_path / name, sensors) for name in ("1.h5", "2.h5")]
     settings = replace(SETTINGS, octaves=True)
     once, twice = estimate(paths[:1], settings), estimate(paths, settings)

@@ -528,7 +528,6 @@ def changed_recording(made: Laboratory) -> list[Path]:
 def test_what_is_wrong_is_found(
     copied: Laboratory, change: Callable[[Laboratory], list[Path]], said: str
 ) -> None:
-    assert copied.verify(copied.certificate(), copied.recording)[0] == 0
     code, text = copied.verify(*change(copied))
     assert code == 3
     assert said in text

@@ -352,7 +352,7 @@ def _of_huge_shape(folder: Path, about: dict[str, Any]) -> None:
 def _of_a_bomb(folder: Path, about: dict[str, Any]) -> None:
     del about
     chunk = next(each for each in (folder / "noise_psd").iterdir() if each.name[0] != ".")
-    chunk.write_bytes(blosc.compress(bytes(1 << 28), b"zstd", 5))
+    chunk.write_bytes(blosc.compress(bytes(1 << 24), b"zstd", 5))
 
 
 @pytest.mark.usefixtures("zarr_threads")
