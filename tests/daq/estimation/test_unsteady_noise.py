@@ -45,7 +45,7 @@ def test_intervals_cover_the_mean_noise(case: str, sensor: int, covered: float) 
             level = level_of(name, case)
             samples[name] = motion @ turn + level[:, None] * rng.standard_normal((N, 3))
             truth.append(float((level**2).mean()) * 2 / RATE)
-        found = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot.results["three-sensor"]
+        found = huddle.self_noise(samples, fs=RATE, segment="2s").snapshot.results["three-sensor"]
         inside, own = slice(5, 90), slice(3 * sensor, 3 * sensor + 3)
         low, high = found.low[inside, own], found.high[inside, own]
         hits.append(np.mean((low <= truth[sensor]) & (truth[sensor] <= high)))
@@ -67,7 +67,7 @@ def test_gusts_are_noise_that_changes(n_sensors: int, ratio: float) -> None:
         + level * rng.standard_normal((n, 2))
         for name in "ABCDE"[:n_sensors]
     }
-    found = huddle.self_noise(samples, fs=RATE, segment="4s").snapshot
+    found = huddle.self_noise(samples, fs=RATE, segment="2s").snapshot
     noise, truth = next(iter(found.results.values())), float((level**2).mean()) * 2 / RATE
     low, high = noise.low[5:72], noise.high[5:72]
     assert np.mean((low <= truth) & (truth <= high)) > 0.9
@@ -129,7 +129,7 @@ def test_levels_are_estimated_once_with_the_noise_that_changes(
         return made[-1][1]
 
     monkeypatch.setattr(snapshot_builder, "noise_estimates", kept)
-    huddle.self_noise(samples, fs=RATE, segment="5s")
+    huddle.self_noise(samples, fs=RATE, segment="2s")
     (stability,) = [used for used, found in made if found.results]
     assert stability.inflations.min() == 1 < stability.inflations.max()
 
@@ -180,7 +180,7 @@ def test_gusts_are_no_motion_and_bound_no_level() -> None:
         + level * rng.standard_normal((n, 3))
         for name in "ABCDE"
     }
-    estimate = huddle.self_noise(samples, fs=RATE, segment="5s")
+    estimate = huddle.self_noise(samples, fs=RATE, segment="2s")
     snapshot, truth = estimate.snapshot, float((level**2).mean()) * 2 / RATE
     found = Result(snapshot, Settings()).spectrum("maximum-likelihood").levels(EDGES)
     low, high = found.ends()
