@@ -26,7 +26,7 @@ from estimator.checks.advice_on_noise import ResponseChanges
 from estimator.self_noise.result import Flag, Refusal
 
 RATE, SECONDS = 50.0, 1500
-SETTINGS = Settings(segment=2.0)
+SETTINGS = Settings(segment=1.0)
 BAND = (2.0, 20.0)
 NOISE = (1.0, 0.5)
 """Variances of the noise of the sensors, white."""

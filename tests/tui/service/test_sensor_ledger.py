@@ -27,7 +27,7 @@ from tui.service.history.ledger import ledger_path, noise_of, noted, record_test
 from tui.web.months import Months
 
 RATE, SECONDS = 64.0, 1200
-SETTINGS = Settings(segment=4.0, methods=("three-sensor",), band=(1.0, 16.0))
+SETTINGS = Settings(segment=2.0, methods=("three-sensor",), band=(1.0, 16.0))
 DAY = 86400 * 10**9
 BEGUN = 1_792_886_400 * 10**9  # 25 October 2026
 SENSOR = """
