@@ -63,7 +63,8 @@ that is less where channels differ."""
 ROUNDS = 8
 """In which the course of motion that is left is found."""
 CONFIRMED = 0.5
-"""Power of a direction at other frequencies, over the least of both, if it is of motion."""
+"""Least power of directions at other frequencies, over their least at both, if they are of motion.
+"""
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
@@ -221,7 +222,7 @@ class BandSteadiness:
             return False
         alarm = FALSE_ALARM / (LONG_TAILS * self.levels.level.shape[1])
         most = critical_value(len(self.levels.level) - 1, alarm)
-        return bool((self.levels.statistic > most).any())
+        return bool((self.levels.statistic[self.levels.expected < KNOWN] > most).any())
 
     @property
     def is_of_motion(self) -> bool:
@@ -257,34 +258,40 @@ def beside_weak_motion(
 
     Directions of the motion are those of the mean of the frequencies, as many as each half of these
     shows and the other confirms: the scatter of noise differs between frequencies. None where
-    directions of the motion differ, too, so that what changes may be motion that these leave.
+    directions of the motion differ, too, so that what changes may be motion that these leave. The
+    channels are scaled by the same ratios at every frequency: by those of single frequencies the
+    motion would turn as bursts of it scatter.
     """
     bins = parts.bins[places]
     if len(places) < FREQUENCIES // 2 or (psd[bins] <= 0).any():
         return None
     (whole,) = parts.joined(places, [np.arange(len(parts.each))]).csm
-    root = np.sqrt(psd[bins])
+    usual, alike = median(psd[bins]), psd.copy()
+    alike[bins] = np.outer((psd[bins] / usual).mean(axis=1), usual)
+    of_bands = functools.partial(of_bands, bands=[places], psd=alike, is_weak=True)
+    root, q = np.sqrt(alike[bins]), maximum.n_factors
     whole = whole / root[:, :, None] / root[:, None, :]
     halves = [some.mean(axis=0) for some in np.array_split(whole, 2)]  # neighbours are correlated
     both = whole.mean(axis=0, keepdims=True)
     shared = np.abs(both[0] - np.eye(both.shape[1])).max()
-    q = maximum.n_factors
     found_in = [np.linalg.eigh(half) for half in halves]
-    least = np.minimum(found_in[0][0], found_in[1][0]) - 1
+    noise = float(median(np.ravel([values for values, _ in found_in])))
+    least = np.minimum(found_in[0][0], found_in[1][0])[::-1] - noise
     for (_, u), other in zip(found_in, halves[::-1], strict=True):
-        again = np.einsum("pa,pq,qa->a", u.conj(), other, u).real
-        confirmed = (again - 1 > CONFIRMED * least) & (least > 0)
-        q = int(np.cumprod(confirmed[::-1][:q]).sum())
+        seen = u.conj().T @ other @ u
+        again = np.array([np.linalg.eigvalsh(seen[-n:, -n:])[0] for n in range(1, q + 1)]) - noise
+        confirmed = (again > CONFIRMED * least[:q]) & (least[:q] > 0)
+        q = int(np.flatnonzero(confirmed).max(initial=-1)) + 1
     found = maximise(both, q)
     if found.boundary.any() and shared < WEAK:  # by scatter
         found = maximise(both, 0)
     if shared > LEAKS or not found.converged[0] or found.boundary.any():
         return None
-    (band,) = of_bands(found, [places], is_weak=True)
+    (band,) = of_bands(found)
     if band is None or band.is_of_motion:
         return None
     if found.n_factors and band.is_unsteady:  # its scatter may be in these
-        (still,) = of_bands(maximise(both, 0), [places], is_weak=True)
+        (still,) = of_bands(maximise(both, 0))
         if still is not None and band.levels is not None:
             inflation = still.scores.inflation(band.levels)
             return replace(band, scores=still.scores, inflation=inflation)

@@ -134,6 +134,23 @@ def test_levels_are_estimated_once_with_the_noise_that_changes(
     assert stability.inflations.min() == 1 < stability.inflations.max()
 
 
+@pytest.mark.parametrize("seed", [4, 8, 16])
+def test_one_burst_of_motion_is_no_noise_that_changes(seed: int) -> None:
+    """Noise of all channels "changed" by 90 %: scales of single frequencies turned the motion."""
+    rng, d = np.random.default_rng(seed), 1 + seed % 3
+    motion = 0.3 * rng.standard_normal((12000, d))
+    motion[4000:4400] *= 20
+    samples = {
+        name: motion @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+        + 10 ** rng.uniform(-0.3, 0.3) * rng.standard_normal((12000, d))
+        for name in "ABC"
+    }
+    found = huddle.self_noise(samples, fs=20.0, segment="5s").snapshot.diagnostics
+    assert NoiseChanges not in [type(each) for each in found.advice]
+    steady = found.diagnosis.stability if found.diagnosis else None
+    assert steady is None or steady.inflation == 1
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_motion_by_other_axes_is_a_misfit_and_no_noise_that_changes(seed: int) -> None:
     rng = np.random.default_rng(seed)
