@@ -187,7 +187,7 @@ def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("ppm", "every"), [(PPM, 3000), pytest.param((*PPM, 0.0), 600, marks=LONG)]
+    ("ppm", "every"), [(PPM, 6000), pytest.param((*PPM, 0.0), 600, marks=LONG)]
 )
 def test_drift_is_corrected_while_the_recording_grows(
     tmp_path: Path, ppm: tuple[float, ...], every: int
