@@ -44,6 +44,8 @@ MUCH_CHANGED = 0.1
 MUCH_FURTHER = 0.01
 """Power of a further dimension over that of the usual ones from which it may be noise that all
 sensors share: a lean of 5° or gradients of 5 % leave less."""
+ONLY_TWO = 1.5
+"""Cross-spectrum of two sensors over that of any others, from which noise that they share is it."""
 MUCH_LEAKS = 0.5
 """Share of the noise that leakage at the edges of segments may be, from which all of it may be."""
 MUCH_NONLINEAR = 0.05
@@ -374,6 +376,35 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
 
 
 @once
+def by_two(snapshot: Snapshot) -> BoolArray:
+    """Return where two sensors of one channel alone have something in common: motion, or noise.
+
+    Of motion that all feel, no pair has `ONLY_TWO` times the cross-spectrum of all others. Shape
+    (n_freqs, n_channels).
+    """
+    own, n = np.nan_to_num(snapshot.data_psd), snapshot.n_effective
+    found = np.zeros(own.shape, np.bool_)
+    if max(snapshot.dims) > 1 or len(snapshot.dims) < _THREE:
+        return found
+    one, other = np.triu_indices(own.shape[1], 1)
+    alone = own[:, one] * own[:, other] / n
+    seen = np.nan_to_num(np.abs(snapshot.csm[:, one, other]) ** 2)
+    bins = _by_block(snapshot.frequency, np.ones_like(seen)) / 2  # neighbours are correlated
+    common, scatter = (
+        _by_block(snapshot.frequency, each)
+        for each in (seen - alone, np.sqrt(alone * (alone + 2 * seen)))
+    )
+    error, rows = NORMAL_95 * scatter / np.sqrt(bins), np.arange(len(own))
+    first = np.argmax(common - 2 * error, axis=1)
+    least, most = (common - 2 * error)[rows, first], common + error
+    most[rows, first] = -math.inf
+    pair = least > ONLY_TWO**2 * most.max(axis=1)
+    for at in (one[first], other[first]):
+        found[rows[pair], at[pair]] = True
+    return found
+
+
+@once
 def may_share(snapshot: Snapshot) -> tuple[BoolArray, BoolArray]:
     """Return where all sensors may share noise, and where two of three may, (n_freqs,) each.
 
@@ -434,6 +465,10 @@ def _of_two(snapshot: Snapshot, method: str, psd: FloatArray) -> Iterator[Contri
     if below.any():
         shares = share[:, None]
         yield contribution(Source.SHARED_NOISE, psd.shape, below=below, above=above, share=shares)
+    if (alone := by_two(snapshot)).any():
+        motion = snapshot.data_psd - snapshot.results[method].noise_psd
+        above = np.where(alone & (motion > 0), motion, 0.0)
+        yield contribution(Source.SHARED_NOISE, psd.shape, above=above)
 
 
 def _alone(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:

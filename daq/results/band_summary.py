@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.estimation.contributions import contributions, may_share, shared_parts
+from daq.estimation.contributions import by_two, contributions, may_share, shared_parts
 from daq.estimation.noise_estimates import ALL_METHODS
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import ChannelLabel, Snapshot, once
@@ -230,7 +230,7 @@ class Spectrum:
         self._width = np.gradient(snapshot.frequency)
         self._correlation = correlation_of(settings)
         self._contributions = contributions(snapshot, noise.method)
-        self._shares = shared_parts(snapshot) > 0
+        self._shares = by_two(snapshot) | (shared_parts(snapshot) > 0)
         beside, names = snapshot.diagnostics.beside, snapshot.sensor_names
         paired = {name for pair in settings.shared_noise for name in pair}
         paired |= {names[n] for each in (beside.pairs if beside else ()) for n in each.pair}

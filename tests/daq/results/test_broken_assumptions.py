@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daq.estimation.contributions import by_two
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
@@ -142,3 +143,19 @@ def test_of_three_sensors_beside_a_dead_one_two_may_share_noise() -> None:
     (passes,) = (str(each) for each in result.facts if each.name == "model-passes")
     assert passes.endswith("no motion that they feel to different degrees.")
     assert "no noise that all or two of these three sensors share" in passes
+
+
+@pytest.mark.parametrize("shared", [0.5, 0.0])
+def test_what_two_sensors_alone_have_in_common_may_be_noise(shared: float) -> None:
+    """Of one channel each: half of their noise was taken for motion, and their intervals missed."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((5, N_SAMPLES, 1))
+    noise[:2] = np.sqrt(1 - shared) * noise[:2] + np.sqrt(shared) * rng.standard_normal(
+        (N_SAMPLES, 1)
+    )
+    motion = np.sqrt(0.1) * rng.standard_normal((N_SAMPLES, 1))
+    snapshot = estimated([motion] * 5, noise)
+    assert held(snapshot, noise).mean() > 0.9
+    of_two = by_two(snapshot).mean(axis=0)
+    assert np.all(of_two[2:] == 0)
+    assert np.all(of_two[:2] > 0.6 if shared else of_two[:2] == 0)
