@@ -222,5 +222,14 @@ class SnapshotDiagnostics:
 
     def inflation_at(self, frequency: FloatArray) -> FloatArray:
         """Return the variance of averages over that of steady noise, shape (n_freqs,)."""
-        steady = None if self.diagnosis is None else self.diagnosis.stability
+        steady = self._stability
         return np.ones(len(frequency)) if steady is None else steady.inflation_at(frequency)
+
+    @property
+    def common(self) -> FloatArray | float:
+        """`Stability.common`; 0 where it is not known."""
+        return 0.0 if self._stability is None else self._stability.common
+
+    @property
+    def _stability(self) -> Stability | None:
+        return None if self.diagnosis is None else self.diagnosis.stability

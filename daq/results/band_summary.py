@@ -261,7 +261,8 @@ class Spectrum:
         rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         width, weight = self._width[here], self._weight[here]
-        bound = band_levels(rest, scatter, edges, correlation, weights=width)
+        common = self._snapshot.diagnostics.common
+        bound = band_levels(rest, scatter, edges, correlation, weights=width).fluctuating(common)
         psd, cumulants = noise.noise_psd[here], noise.cumulants[:, here]
         parts = [each.at(here) for each in self._contributions]
         below = self._below_bound(edges, here, rest)
@@ -270,7 +271,7 @@ class Spectrum:
             cumulants[:, below] = scatter[:, below]
             inside = np.repeat(np.logical_or.reduceat(below, edges[:-1]), np.diff(edges), axis=0)
             parts = list(up_to(parts, rest, below, psd, inside))
-        found = band_levels(psd, cumulants, edges, correlation, weights=width)
+        found = band_levels(psd, cumulants, edges, correlation, weights=width).fluctuating(common)
         widening = tuple(each.in_bands(edges, weight, psd) for each in parts)
         unknown = (noise.flags[here] & Flag.UNIDENTIFIED) != 0
         return Levels(found, widening, bound, np.logical_or.reduceat(unknown, edges[:-1]))
@@ -440,6 +441,7 @@ class Estimate:
             return [float(median) for median in medians]
         width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
         found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
+        found = found.fluctuating(snapshot.diagnostics.common)
         with np.errstate(invalid="ignore", divide="ignore"):
             cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
         bounds = (noise.flags[edges[0] : edges[-1]] & Flag.UNIDENTIFIED) != 0

@@ -1,10 +1,14 @@
-"""Single segments: disturbed ones, and gains that change from one to the next.
+"""Single segments: disturbed ones, gains that change from one to the next, noise that fluctuates.
 
 A segment is disturbed if its residual beside the motion stands out. A sensor whose gain is by g off
 in a segment leaves g times the motion in its residual, at all frequencies; noise leaves at two
 frequencies what is independent. So products of what the motion explains of residuals, at different
 frequencies, have the mean g², whatever the noise does. Less those of one segment with a later one,
 they show what gains do that no part of time shows.
+
+So do products of the noise of a channel at different frequencies. Noise whose loudness changes
+faster than parts of time show, as in gusts, is not independent there: a mean over many frequencies
+is known no better than its loudness.
 """
 
 from __future__ import annotations
@@ -30,10 +34,14 @@ RESTLESS = 3.0
 """Scatter of single segments over that of steady noise, from which none is disturbed."""
 LATER = 2
 """Segments after which a gain that drifts is the same: those between overlap both."""
+LASTS = 4
+"""The same for the loudness of noise; parts of time show what lasts much longer."""
 TOGETHER = 4
 """Segments whose products are averaged before their scatter is measured: neighbours overlap."""
 UNSTABLE = 4.5
 """Standard errors from which gains change from segment to segment."""
+FLUCTUATES = 2.0
+"""The same for the loudness of noise: it widens intervals, and nothing is said of it."""
 LARGEST = 0.5
 """Variance of a gain over the largest of all, from which it is no part of that in the motion."""
 MAX_DISTURBED = 0.2
@@ -76,6 +84,9 @@ class SegmentFindings:
     gains, sure : float64, shape (n_sensors,)
         Variance of the gains of a sensor between segments, 0 unless significant; over its standard
         error.
+    loudness : float64, shape (n_channels,)
+        Variance of a mean of the noise over time, times the number of segments, that all
+        frequencies have in common, as a share of its square; 0 unless significant.
     """
 
     disturbed: BoolArray
@@ -83,12 +94,15 @@ class SegmentFindings:
     is_restless: bool
     gains: FloatArray
     sure: FloatArray
+    loudness: FloatArray
 
     @classmethod
     def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
         """Return findings of segments that show nothing."""
         disturbed, excess = np.zeros(n_segments, np.bool_), np.zeros((1, sum(dims)))
-        return cls(disturbed, excess, False, *np.zeros((2, len(dims))))
+        return cls(
+            disturbed, excess, False, *np.zeros((2, len(dims))), loudness=np.zeros(sum(dims))
+        )
 
 
 def segment_findings(
@@ -116,17 +130,19 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    gains, power = _Gains(own, groups, dims), []
+    gains, powers = _Gains(own, groups, dims), []
     for residual, motion in residuals:
-        power.append((np.abs(residual) ** 2).sum(axis=(1, 2)))
+        powers.append((np.abs(residual) ** 2).sum(axis=1))
         gains.add(residual, motion)
     variance, sure = gains.variance()
     found = replace(none, gains=variance, sure=sure)
     groups = groups[:n_good]
     if not groups:
         return found
+    mixing = np.stack([(np.abs(residuals.projector[group]) ** 2).sum(axis=0) for group in groups])
+    found = replace(found, loudness=_loudness(np.stack(powers[:n_good]), mixing))
     degrees = np.array([own[group].sum() for group in groups])
-    out, calm = _disturbed(np.stack(power[:n_good], axis=1), degrees)
+    out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)
     found = replace(found, is_restless=not calm.all())
     if not out.any() or variance.any():
         return found
@@ -175,6 +191,34 @@ class _Gains:
         sure *= math.sqrt(n_blocks)
         is_seen = (sure > UNSTABLE) & (total > LARGEST * total.max())
         return np.where(is_seen, total, 0.0), sure
+
+
+def _loudness(power: FloatArray, mixing: FloatArray) -> FloatArray:
+    """Return `loudness` of `SegmentFindings`.
+
+    Parameters
+    ----------
+    power : float64, shape (n_groups, n_segments, n_channels)
+        Of the residuals.
+    mixing : float64, shape (n_groups, n_channels, n_channels)
+        Part of the noise of every channel in these.
+    """
+    n_groups, n = len(power), power.shape[1] - LASTS
+    if n_groups == 1 or n < LASTS:
+        return np.zeros(power.shape[2])
+    own = power @ np.linalg.pinv(mixing).swapaxes(1, 2)
+    mean = own.mean(axis=1, keepdims=True)
+    apart = np.where(mean > 0, own / np.where(mean > 0, mean, 1.0) - 1, 0.0)
+    n_pairs = n_groups * (n_groups - 1)
+    now, *soon, later = (
+        _across(apart[:, :n], apart[:, lag : lag + n]).mean(axis=0) / n_pairs
+        for lag in range(LASTS + 1)
+    )
+    by_chance = 2 * (apart**2).mean(axis=(0, 1)) / math.sqrt(n_pairs * n)
+    seen = now - later > FLUCTUATES * by_chance
+    return np.where(
+        seen, np.maximum(now - later + 2 * np.sum(soon - later, axis=0), now - later), 0
+    )
 
 
 def _across(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -153,6 +153,9 @@ class Stability:
         That channel.
     is_restless : bool
         Whether the noise changes from segment to segment, at some frequencies.
+    common : float64, shape (n_channels,)
+        Variance of the mean noise that all frequencies have in common, as a share of its square,
+        since its loudness changes from segment to segment.
     steadied : tuple of Steadied or None
         Averages without the changes of responses, of each range of frequencies; None where nothing
         tells of any.
@@ -172,6 +175,7 @@ class Stability:
     excess: float = field(metadata={"key": "excess_share"})
     channel: int
     is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
+    common: FloatArray = field(default_factory=lambda: np.zeros(1), metadata=NOT_IN_JSON)
     steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
 
     @property
@@ -213,6 +217,7 @@ class Stability:
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
             added=added,
+            common=np.stack([each.common for each in found]).max(axis=0),
             explained=np.concatenate([each.explained for each in found]),
             within=np.concatenate([each.within for each in found]),
             steadied=tuple(
@@ -244,8 +249,8 @@ class Stability:
 
     def among(self, channels: Sequence[int], sensors: Sequence[int], n_channels: int) -> Stability:
         """Return the same with channels and sensors numbered among all, dead ones included."""
-        added = np.zeros(n_channels)
-        added[list(channels)] = self.added
+        added, common = np.zeros((2, n_channels))
+        added[list(channels)], common[list(channels)] = self.added, self.common
         explained, within = np.zeros((2, len(self.low), n_channels))
         explained[:, list(channels)], within[:, list(channels)] = self.explained, self.within
         return replace(
@@ -254,6 +259,7 @@ class Stability:
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
+            common=common,
             explained=explained,
             within=within,
             steadied=self.steadied if len(channels) == n_channels else (),
@@ -405,6 +411,7 @@ def stability(
         excess=float(single.excess.max()),
         channel=int(single.excess.max(axis=0).argmax()),
         is_restless=single.is_restless,
+        common=single.loudness / n_effective,
         steadied=() if without is None else (without,),
     )
 

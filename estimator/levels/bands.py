@@ -12,6 +12,8 @@ the same correlation.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +49,11 @@ class BandLevels:
     def spread(self) -> FloatArray:
         """Standard deviation of the mean, shape (n_bands, n_channels)."""
         return np.asarray(np.sqrt(np.maximum(self.cumulants[0], 0.0)))
+
+    def fluctuating(self, variance: FloatArray | float) -> BandLevels:
+        """Return levels of noise whose loudness has this variance, over its square, beside."""
+        beside = np.stack([self.mean**k * variance ** (k - 1) for k in (2, 3, 4)])
+        return replace(self, cumulants=self.cumulants + beside)
 
     def interval(self, quantile: float = NORMAL_95) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the interval by the scatter alone."""
