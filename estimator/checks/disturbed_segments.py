@@ -100,9 +100,8 @@ class SegmentFindings:
     def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
         """Return findings of segments that show nothing."""
         disturbed, excess = np.zeros(n_segments, np.bool_), np.zeros((1, sum(dims)))
-        return cls(
-            disturbed, excess, False, *np.zeros((2, len(dims))), loudness=np.zeros(sum(dims))
-        )
+        nothing = np.zeros(len(dims))
+        return cls(disturbed, excess, False, nothing, nothing, np.zeros(sum(dims)))
 
 
 def segment_findings(
