@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
@@ -49,7 +50,7 @@ def import_(
     bench: Path | None = None,
     response: list[Path] | None = None,
     response_for: list[str] | None = None,
-    sampling_rate: Annotated[float | None, typer.Option(min=1e-06)] = None,
+    sampling_rates: Annotated[list[str] | None, typer.Option("--sampling-rate")] = None,
     channels: list[str] | None = None,
     start: str | None = None,
     end: str | None = None,
@@ -88,8 +89,9 @@ def import_(
         Recording to write (.h5).
     bench : BENCH
         Bench file with sensitivities, names and settings.
-    sampling_rate : HZ
-        Sampling rate, if the files do not give it.
+    sampling_rates : HZ|SENSOR=HZ
+        Sampling rate, if the files do not give it; or that of a sensor, in place of the recorded
+        one (B=100.9), which may be repeated.
     start : UTC
         First time to import: 2026-11-21T03:00:00.
     end : UTC
@@ -128,7 +130,7 @@ def import_(
         bench=bench,
         response=response or [],
         response_for=response_for or [],
-        sampling_rate=sampling_rate,
+        sampling_rate=_rate([each for each in sampling_rates or [] if "=" not in each]),
         selection=selected(
             channels=channels or [],
             start=start,
@@ -140,6 +142,9 @@ def import_(
         ),
         json=json,
         overlap=read_option("overlap", segments),
+        sampling_rates=read_option(
+            "sampling_rates", [each for each in sampling_rates or [] if "=" in each]
+        ),
         **wanted,
     )
 
@@ -235,6 +240,19 @@ def import_recording(
     write_json(json, {"recording": str(out), **asdict(result)})
     if result.problems:
         raise typer.Exit(ExitCode.TROUBLE)
+
+
+def _rate(given: Sequence[str]) -> float | None:
+    """Return a sampling rate in Hz, if one is given."""
+    try:
+        (rate,) = map(float, given) if given else (None,)
+    except ValueError:
+        rate = 0.0
+    if rate is not None and not 0 < rate < math.inf:
+        raise typer.BadParameter(
+            f"--sampling-rate {', '.join(given)}: expected one rate in Hz such as 100, or B=100.9"
+        )
+    return rate
 
 
 def assigned(text: str) -> tuple[str, Path]:

@@ -412,7 +412,7 @@ def grid_of(times: NDArray[np.int64], sampling_rate: float | None) -> RowTimes:
         row = int(np.argmin(steps)) + 2 if steps.size else 1
         raise ValueError(
             "expected a time column of two rows or more that always increases; it does not at row"
-            f" {row}"
+            f" {row}: if a clock was set there, leave the column out, and give the sampling rate"
         )
     coarse = np.mean(steps == 0) > _REPEATED
     rows = np.concatenate([[0], np.flatnonzero(steps) + 1]) if coarse else np.arange(len(times))

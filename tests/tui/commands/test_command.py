@@ -111,6 +111,12 @@ def test_main_commands_have_a_worked_example_of_options_that_exist(name: str) ->
         assert set(re.findall(r"--[\w-]+", rest)) <= known
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_command_has_a_flag_twice(name: str) -> None:
+    flags = [flag for each in subcommand(name).params for flag in each.opts]
+    assert sorted(set(flags)) == sorted(flags)
+
+
 def test_a_bare_command_and_help_show_help() -> None:
     assert printed() == printed("--help") == printed("help")
     assert printed("help", "estimate") == printed("estimate", "--help")

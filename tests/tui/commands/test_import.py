@@ -82,6 +82,19 @@ def test_of_one_sensor_at_two_rates_the_higher_is_imported(tmp_path: Path) -> No
         assert (sensor.sampling_rate, sensor.n_samples) == (100.0, 1000)
 
 
+def test_the_rate_of_files_without_times_and_that_of_a_sensor_are_one_option(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "a.csv").write_text("A.X,B.X\n" + "1,2\n3,5\n" * 500, encoding="utf-8")
+    start = ["import", tmp_path / "a.csv", "-o", tmp_path / "a.h5", "--columns", "A.X,B.X"]
+    huddle(*start, "--sampling-rate", "0", code=ExitCode.USAGE)
+    huddle(*start, "--sampling-rate", "100", "--sampling-rate", "B=99.5")
+    with Recording.open(tmp_path / "a.h5") as recording:
+        assert {each.sampling_rate for each in recording.sensors} == {100.0}
+        assert recording.bench is not None
+        assert recording.bench.estimate.sampling_rates == {"B": 99.5}
+
+
 def test_what_single_channels_lack_is_printed(tmp_path: Path) -> None:
     write_records(tmp_path / "a", counts(600, 1), channel="HHZ")
     write_records(tmp_path / "b", counts(200, 2), channel="HHN", start=START + 100 * STEP)
