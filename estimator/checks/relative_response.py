@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -102,6 +102,8 @@ def _largest(omega: FloatArray, weighted: ComplexArray, *, start: float, step: f
 
 _PRODUCT_BYTES = 1 << 24  # of products of sensors with all others that are kept
 _STEPS = 4  # steps of least squares from the coarse delay
+_SOME = 64  # frequencies, by which it is seen whether spectra cancel in a sum
+_CANCELLED = 0.3  # of what sums would be without
 _PARTS = 8  # parts of the band, for the scatter of the angles
 _MIN_PARTS = 4
 
@@ -374,6 +376,12 @@ def _response(
         _weighted_sums(csm, inside, channels, by, starts)[:, :, rest]
         for channels, by in zip(own, (weight / at.power, weight / at.power * late), strict=True)
     )
+    turn = _of_late_others(at, own[0], rest, np.linalg.norm(right.sum(axis=0)))
+    if turn is not None:
+        right, left = (
+            _sums(_part(csm, inside, channels, rest) * (by[:, None] * turn)[:, None], starts)
+            for channels, by in zip(own, (weight / at.power, weight / at.power * late), strict=True)
+        )
     matrix = _over(left.sum(axis=0), right.sum(axis=0)).real
     # one after the other without a part of the band, for the scatter
     without = _over(_others(left), _others(right)).real if len(starts) > 1 else matrix[None][:0]
@@ -405,6 +413,26 @@ def _response(
         is_ambiguous=is_ambiguous,
         coherence=math.nan,
     )
+
+
+def _of_late_others(
+    at: _At, first: IntArray, rest: IntArray, found: np.floating[Any]
+) -> ComplexArray | None:
+    """Return what turns channels back that lag, shape (n_freqs, n_rest): their sums cancel.
+
+    None where they do not: `found` is the norm of the sum of spectra with sensor `first`.
+    """
+    f, by = at.frequency, at.weight / at.power
+    some = slice(None, None, max(1, len(f) // _SOME))
+    each = np.abs(_part(at.csm, at.inside[some], first, rest)) * by[some, None, None]
+    whole = np.linalg.norm(each.sum(axis=0)) * by.sum() / by[some].sum()
+    if found > _CANCELLED * whole:
+        return None
+    spectra = _part(at.csm, at.inside, first, rest) * by[:, None, None]
+    late = [_coarse_delay(f, spectra[:, :, [n]]) for n in range(len(rest))]
+    turn = np.exp(2j * np.pi * f[:, None] * np.array(late))
+    better = np.linalg.norm((spectra * turn[:, None]).sum(axis=0))
+    return turn if better > 2 * found else None
 
 
 class PairProducts:

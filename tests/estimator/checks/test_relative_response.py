@@ -54,6 +54,17 @@ def test_rotation_gains_and_delay_are_recovered() -> None:
     np.testing.assert_allclose(back.matrix @ found.matrix, np.eye(3), atol=1e-6)
 
 
+@pytest.mark.parametrize("n_others", [1, 2])
+def test_others_that_lag_do_not_cancel_in_sums_over_the_band(n_others: int) -> None:
+    gains, late = np.array([1.02, 0.97, 1.0]), (0.0, 2e-3, *(0.4, -0.7)[:n_others])
+    true = bench([np.eye(3), np.diag(gains), *[np.eye(3)] * n_others], delays=late)
+    csm = wishart(true, 60, np.random.default_rng(5))[0]
+    found = relative_response(csm, FREQUENCY, dims=(3,) * len(late), first=0, second=1)
+    assert found.rotation_deg < 0.1
+    np.testing.assert_allclose(found.gains, gains, atol=1e-3)
+    assert found.delay == pytest.approx(2e-3, abs=1e-5)
+
+
 def test_a_known_delay_has_the_sign_the_convention_says() -> None:
     """The second sensor's record is the first's, one and a half samples later."""
     rng = np.random.default_rng(1)
