@@ -47,6 +47,8 @@ MIN_AVERAGES = 2.0
 """Without which nothing is diagnosed: in one average all channels are coherent, as copies are."""
 BY_CLOCKS = 0.2
 """Change of a gain as a fraction, or of a direction in rad, from which wrong clocks explain it."""
+BY_PHASE = 4.0
+"""Samples that a sensor whose response differs may seem to lag by."""
 _MOST_RESIDUAL = 1e3  # s: beyond any segment; infinite where an error cannot be measured
 _MOST_TURN = 50.0  # rad²: no motion is left in common
 _UP = {"z", "up", "down", "vertical", "+z", "-z"}
@@ -463,8 +465,10 @@ def _is_across(
 
 
 def _is_by_response(advice: Advice, differ: set[int]) -> bool:
-    """Whether a lag comes from the phase of a sensor whose response differs."""
-    return isinstance(advice, Delay) and bool(differ.intersection(advice.sensors))
+    """Whether a lag comes from the phase of a sensor whose response differs: a few samples."""
+    if not isinstance(advice, Delay) or abs(advice.delay_samples) > BY_PHASE:
+        return False
+    return bool(differ.intersection(advice.sensors))
 
 
 def _n_known(band: Band) -> int:

@@ -17,7 +17,7 @@ from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
-from estimator.checks.advice_on_sensors import UnequalResponses
+from estimator.checks.advice_on_sensors import Delay, UnequalResponses
 from estimator.methods import self_noise
 from estimator.self_noise.result import SelfNoise
 from sim_devices.world.scenario import Scenario
@@ -96,6 +96,18 @@ def test_what_leaks_is_predicted_and_widens_intervals(biased: Snapshot) -> None:
     (advice,) = (a for a in biased.diagnostics.advice if isinstance(a, UnequalResponses))
     assert advice.sensors == (1,)
     assert advice.share > 0.8
+
+
+def test_a_lag_of_many_samples_is_named_beside_a_response_that_differs(tmp_path: Path) -> None:
+    late = {
+        name: np.roll(each, 20 * (name == "c"), axis=0) for name, each in samples("acd").items()
+    }
+    sensors = {name: Sensor(each, rate=RATE, clock="one") for name, each in late.items()}
+    advice = estimate([write(tmp_path / "r.h5", sensors)], OFF).diagnostics.advice
+    assert any(isinstance(each, UnequalResponses) for each in advice)
+    lags = [each for each in advice if isinstance(each, Delay)]
+    assert {each.sensors for each in lags} == {(0, 1), (1, 2)}
+    assert {round(abs(each.delay_samples), 2) for each in lags} == {20.0}
 
 
 def test_a_response_that_differs_is_not_also_a_clock_that_lags(tmp_path: Path) -> None:
