@@ -225,10 +225,9 @@ class SnapshotDiagnostics:
         steady = self._stability
         return np.ones(len(frequency)) if steady is None else steady.inflation_at(frequency)
 
-    @property
-    def common(self) -> FloatArray | float:
-        """`Stability.common`; 0 where it is not known."""
-        return 0.0 if self._stability is None else self._stability.common
+    def common_at(self, frequency: FloatArray) -> FloatArray | None:
+        """Return `Stability.common` at frequencies; None where it is not known."""
+        return None if self._stability is None else self._stability.common_at(frequency)
 
     @property
     def _stability(self) -> Stability | None:

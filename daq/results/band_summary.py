@@ -10,7 +10,7 @@ import enum
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -229,6 +229,7 @@ class Spectrum:
         self._noise, self._snapshot = noise, snapshot
         self._width = np.gradient(snapshot.frequency)
         self._correlation = correlation_of(settings)
+        self._common = snapshot.diagnostics.common_at(snapshot.frequency)
         self._contributions = contributions(snapshot, noise.method)
         self._shares = by_two(snapshot) | (shared_parts(snapshot) > 0)
         beside, names = snapshot.diagnostics.beside, snapshot.sensor_names
@@ -261,8 +262,11 @@ class Spectrum:
         rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         width, weight = self._width[here], self._weight[here]
-        common = self._snapshot.diagnostics.common
-        bound = band_levels(rest, scatter, edges, correlation, weights=width).fluctuating(common)
+        common = None if self._common is None else self._common[here]
+        levels = partial(
+            band_levels, edges=edges, correlation=correlation, weights=width, common=common
+        )
+        bound = levels(rest, scatter)
         psd, cumulants = noise.noise_psd[here], noise.cumulants[:, here]
         parts = [each.at(here) for each in self._contributions]
         below = self._below_bound(edges, here, rest)
@@ -271,7 +275,7 @@ class Spectrum:
             cumulants[:, below] = scatter[:, below]
             inside = np.repeat(np.logical_or.reduceat(below, edges[:-1]), np.diff(edges), axis=0)
             parts = list(up_to(parts, rest, below, psd, inside))
-        found = band_levels(psd, cumulants, edges, correlation, weights=width).fluctuating(common)
+        found = levels(psd, cumulants)
         widening = tuple(each.in_bands(edges, weight, psd) for each in parts)
         unknown = (noise.flags[here] & Flag.UNIDENTIFIED) != 0
         return Levels(found, widening, bound, np.logical_or.reduceat(unknown, edges[:-1]))
@@ -440,8 +444,11 @@ class Estimate:
             medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
             return [float(median) for median in medians]
         width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
-        found = band_levels(noise.noise_psd, noise.cumulants, edges, correlation, weights=width)
-        found = found.fluctuating(snapshot.diagnostics.common)
+        found = band_levels(
+            *(noise.noise_psd, noise.cumulants, edges, correlation),
+            weights=width,
+            common=snapshot.diagnostics.common_at(snapshot.frequency),
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
         bounds = (noise.flags[edges[0] : edges[-1]] & Flag.UNIDENTIFIED) != 0

@@ -153,7 +153,7 @@ class Stability:
         That channel.
     is_restless : bool
         Whether the noise changes from segment to segment, at some frequencies.
-    common : float64, shape (n_channels,)
+    common : float64, shape (n_bands, n_channels)
         Variance of the mean noise that all frequencies have in common, as a share of its square,
         since its loudness changes from segment to segment.
     steadied : tuple of Steadied or None
@@ -175,7 +175,7 @@ class Stability:
     excess: float = field(metadata={"key": "excess_share"})
     channel: int
     is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
-    common: FloatArray = field(default_factory=lambda: np.zeros(1), metadata=NOT_IN_JSON)
+    common: FloatArray = field(default_factory=lambda: np.zeros((1, 1)), metadata=NOT_IN_JSON)
     steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
 
     @property
@@ -217,7 +217,7 @@ class Stability:
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
             added=added,
-            common=np.stack([each.common for each in found]).max(axis=0),
+            common=np.concatenate([each.common for each in found]),
             explained=np.concatenate([each.explained for each in found]),
             within=np.concatenate([each.within for each in found]),
             steadied=tuple(
@@ -230,6 +230,10 @@ class Stability:
     def inflation_at(self, frequency: FloatArray) -> FloatArray:
         """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
         return 1 + self._at(frequency, self.inflations[:, None] - 1)[:, 0]
+
+    def common_at(self, frequency: FloatArray) -> FloatArray:
+        """Return `common` at frequencies, shape (n_freqs, n_channels); 0 outside of the bands."""
+        return self._at(frequency, self.common)
 
     def changed_at(self, frequency: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the share of the noise that changes of responses may be, (n_freqs, n_channels).
@@ -249,10 +253,11 @@ class Stability:
 
     def among(self, channels: Sequence[int], sensors: Sequence[int], n_channels: int) -> Stability:
         """Return the same with channels and sensors numbered among all, dead ones included."""
-        added, common = np.zeros((2, n_channels))
-        added[list(channels)], common[list(channels)] = self.added, self.common
-        explained, within = np.zeros((2, len(self.low), n_channels))
+        added = np.zeros(n_channels)
+        added[list(channels)] = self.added
+        explained, within, common = np.zeros((3, len(self.low), n_channels))
         explained[:, list(channels)], within[:, list(channels)] = self.explained, self.within
+        common[:, list(channels)] = self.common
         return replace(
             self,
             parts=self.parts.among(channels, n_channels),
@@ -411,7 +416,7 @@ def stability(
         excess=float(single.excess.max()),
         channel=int(single.excess.max(axis=0).argmax()),
         is_restless=single.is_restless,
-        common=single.loudness / n_effective,
+        common=np.tile(single.loudness / n_effective, (len(low), 1)),
         steadied=() if without is None else (without,),
     )
 

@@ -12,8 +12,6 @@ the same correlation.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,11 +48,6 @@ class BandLevels:
         """Standard deviation of the mean, shape (n_bands, n_channels)."""
         return np.asarray(np.sqrt(np.maximum(self.cumulants[0], 0.0)))
 
-    def fluctuating(self, variance: FloatArray | float) -> BandLevels:
-        """Return levels of noise whose loudness has this variance, over its square, beside."""
-        beside = np.stack([self.mean**k * variance ** (k - 1) for k in (2, 3, 4)])
-        return replace(self, cumulants=self.cumulants + beside)
-
     def interval(self, quantile: float = NORMAL_95) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the interval by the scatter alone."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -90,6 +83,7 @@ def band_levels(
     correlation: FloatArray,
     *,
     weights: FloatArray | None = None,
+    common: FloatArray | None = None,
 ) -> BandLevels:
     """Average the noise of channels over bands of bins.
 
@@ -105,6 +99,8 @@ def band_levels(
         From :func:`bin_correlation`.
     weights : float64, shape (n_freqs,), optional
         Weights of the bins in the mean, such as their widths.
+    common : float64, shape (n_freqs, n_channels), optional
+        Variance that all bins have in common, as a share of the square of the noise.
 
     Returns
     -------
@@ -136,6 +132,9 @@ def band_levels(
             variance += 2 * correlation[lag] * np.add.reduceat(pairs, starts, axis=0)
         excess = np.where(added[0] > 0, variance / added[0], 1.0)
         found = np.stack([added[m] * excess ** (m + 1) / total ** (m + 2) for m in range(3)])
+    if common is not None:
+        most = np.maximum.reduceat(common[first:last], starts, axis=0)
+        found += np.stack([mean**k * most ** (k - 1) for k in (2, 3, 4)])
     return BandLevels(mean, found, np.logical_and.reduceat(known, starts, axis=0))
 
 
