@@ -20,7 +20,6 @@ from estimator.checks.disturbed_segments import SegmentCourse
 from estimator.checks.noise_within import beside_matrices
 from estimator.checks.relative_response import (
     PARTNERS,
-    PairProducts,
     RelativeResponse,
     relative_response,
 )
@@ -535,7 +534,6 @@ def _responses(
     if len(there.channels) < csm.shape[1] and len(there.whole) > 1:
         csm = csm[np.ix_(range(len(csm)), there.channels, there.channels)]
         checked = coherency(csm, there.dims)
-    products = PairProducts(csm, there.dims)
     for first, second in _compared(there, found):
         pair = there.sensors[first], there.sensors[second]
         with suppress(InsufficientDataError):  # not comparable
@@ -548,7 +546,6 @@ def _responses(
                 vertical=vertical,
                 coherence=coherence,
                 checked=checked,
-                products=products,
             )
             found.append(replace(response, first=pair[0], second=pair[1]))
     return tuple(found)

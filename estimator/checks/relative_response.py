@@ -29,7 +29,6 @@ from estimator.levels.interval import worth
 from estimator.records import Hertz, Seconds, dataclass
 from estimator.self_noise.coherency import (
     Coherency,
-    blocks,
     check_dims,
     check_frequency,
     coherency,
@@ -100,7 +99,6 @@ def _largest(omega: FloatArray, weighted: ComplexArray, *, start: float, step: f
     return at - (after - before) ** 2 / (8 * bend) if bend < 0 else at
 
 
-_PRODUCT_BYTES = 1 << 24  # of products of sensors with all others that are kept
 _STEPS = 4  # steps of least squares from the coarse delay
 _SOME = 64  # frequencies, by which it is seen whether spectra cancel in a sum
 _CANCELLED = 0.3  # of what sums would be without
@@ -186,7 +184,6 @@ def relative_response(
     vertical: int | None = None,
     coherence: CanonicalCoherence | None = None,
     checked: Coherency | None = None,
-    products: PairProducts | None = None,
 ) -> RelativeResponse:
     """Return rotation, gains, non-orthogonality and delay of one sensor against another.
 
@@ -211,8 +208,6 @@ def relative_response(
         Canonical coherence of the same matrix, to avoid its computation for several pairs.
     checked : Coherency, optional
         Coherency of the same matrix, likewise.
-    products : PairProducts, optional
-        Of the same matrix, likewise.
 
     Returns
     -------
@@ -278,11 +273,11 @@ def relative_response(
     at = _At(csm, frequency[inside], weight[inside], inside, _power(csm, dims, first)[inside])
 
     def by(rest: IntArray) -> RelativeResponse:
-        if products is None or len(rest) == d:
+        if len(rest) == d:
             S_ik, S_jk = (_part(csm, inside, each, rest) / at.power[:, None, None] for each in own)
             transfer = _over(S_jk, S_ik)
         else:
-            transfer = _quotient(*(each[inside] for each in products.of(first, second)))
+            transfer = _quotient(*_with_others(csm, inside, own))
         return _response(at, transfer, own, rest, horizontal, sensors=(first, second))
 
     found = _between(*(by(each) for each in own)) if is_pair else by(rest)
@@ -435,66 +430,16 @@ def _of_late_others(
     return turn if better > 2 * found else None
 
 
-class PairProducts:
-    """Sums of ``S_jk S_ik*`` and of ``S_ik S_ik*`` over all other sensors k, by pairs of i and j.
-
-    Those of some sensors i with all j are made together, and kept until others are asked for.
-
-    Parameters
-    ----------
-    csm : complex128, shape (n_freqs, n_channels, n_channels)
-    dims : tuple of int
-        Channels of each sensor.
-    """
-
-    def __init__(self, csm: ComplexArray, dims: tuple[int, ...]) -> None:
-        self._csm, self._dims = csm, dims
-        self._first = np.cumsum([0, *dims])
-        self._made: dict[int, tuple[ComplexArray, ComplexArray]] = {}
-
-    def of(self, first: int, second: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return both sums for sensors i and j, shapes (n_freqs, d_j, d_i) and (n_freqs, d_i, d_i).
-
-        Neither has a part of the channels of i and j themselves.
-        """
-        if first not in self._made:
-            self._made = self._make(first)
-        crossed, inner = self._made[first]
-        return crossed[:, self._first[second] : self._first[second + 1]], inner[:, second]
-
-    def _make(self, begin: int) -> dict[int, tuple[ComplexArray, ComplexArray]]:
-        n_freqs, p = self._csm.shape[:2]
-        each = 16 * n_freqs * (p + len(self._dims) * max(self._dims)) * max(self._dims)
-        some = range(begin, min(begin + max(1, _PRODUCT_BYTES // each), len(self._dims)))
-        made = {
-            i: (
-                np.empty((n_freqs, p, self._dims[i]), np.complex128),
-                np.empty((n_freqs, len(self._dims), self._dims[i], self._dims[i]), np.complex128),
-            )
-            for i in some
-        }
-        sensor = np.repeat(np.arange(len(self._dims)), self._dims)
-        alike = sensor[:, None] == sensor
-        for block in blocks(n_freqs, p):
-            part = np.where(alike, 0.0, self._csm[block])
-            for i, (crossed, inner) in made.items():
-                mine = part[:, self._first[i] : self._first[i + 1]]
-                with np.errstate(invalid="ignore"):  # what is not known is not asked for
-                    crossed[block] = part @ mine.conj().swapaxes(1, 2)
-                    inner[block] = self._without_each(mine)
-        return made
-
-    def _without_each(self, mine: ComplexArray) -> ComplexArray:
-        """Return sums over all sensors but each: of those before and after it, without cancelling.
-
-        Shape (n_freqs, n_sensors, d, d).
-        """
-        squares = mine[:, :, None] * mine[:, None].conj()
-        of_each = np.moveaxis(np.add.reduceat(squares, self._first[:-1], axis=3), 3, 1)
-        found = np.zeros_like(of_each)
-        found[:, 1:] += np.cumsum(of_each, axis=1)[:, :-1]
-        found[:, :-1] += np.cumsum(of_each[:, ::-1], axis=1)[:, -2::-1]
-        return found
+def _with_others(
+    csm: ComplexArray, inside: IntArray, own: Sequence[IntArray]
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the sums of ``S_jk S_ik*`` and ``S_ik S_ik*`` over all other sensors k."""
+    some = slice(int(inside[0]), int(inside[-1]) + 1)
+    one, two = (csm[some, channels[0] : channels[-1] + 1] for channels in own)
+    towards = one.conj().swapaxes(1, 2)
+    towards[:, np.concatenate(own)] = 0.0
+    with np.errstate(invalid="ignore"):  # what is not known is not asked for
+        return (two @ towards)[inside - inside[0]], (one @ towards)[inside - inside[0]]
 
 
 def _weighted_sums(
