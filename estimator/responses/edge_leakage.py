@@ -210,83 +210,59 @@ def channel_responses(
     own = [np.array(own_channels(dims, sensor)) for sensor in range(n_sensors)]
     ratio = np.full((n_freqs, n_channels, n_sensors), np.nan, dtype=np.complex128)
     coherence = np.zeros((n_freqs, n_channels, n_sensors))
-    directions = _directions(csm, dims, own)
-    # by each sensor, of as many channels as the largest has: zero for the others
-    combined = np.zeros((n_channels, n_sensors, max(dims)))
-    for (c, j), direction in directions.items():
-        combined[c, j, : len(direction)] = direction
+    combined = _directions(csm, dims, own)
     thirds = np.flatnonzero(combined.any(axis=(0, 2)))
     thirds = thirds[:: -(-len(thirds) // _MAX_THIRDS) or 1]
+    around = combined.any(axis=2)
+    around &= (around.sum(axis=1) > 1)[:, None]
+    at, d = np.arange(len(thirds)), max(dims)
+    by = combined.swapaxes(0, 1)
+    by_two = by[:, None, :, :, None] * by[thirds, :, None]
+    by_own = (by[:, :, :, None] * by[:, :, None]).reshape(n_sensors, n_channels, d * d)
     for some in blocks(n_freqs, n_channels):
-        padded = _padded(csm[some], dims)
-        within = np.einsum("fjdje->fjde", padded).real
-        towards = padded[:, :, :, thirds]
-        for c in range(n_channels):
-            around = combined[c].any(axis=1)
-            if np.count_nonzero(around) < 2:
-                continue
-            crossed, among = _predictions(towards, csm[some, c], combined[c], dims, thirds)
-            by = combined[c]
-            own_power = (within * (by[:, :, None] * by[:, None])).sum(axis=(2, 3))
-            among[:, thirds, np.arange(len(thirds))] = 0.0  # the third is another
-            power = np.maximum(csm[some, c, c].real, 0.0)[:, None]
-            with np.errstate(invalid="ignore", divide="ignore"):
-                inverse = np.where(own_power > 0, 1 / own_power, 0.0)[:, thirds, None]
-                sizes = ((among.real**2 + among.imag**2) @ inverse)[:, :, 0]
-                mean = (among.conj() @ (crossed[:, thirds, None] * inverse))[:, :, 0] / sizes
-                found = np.abs(crossed) ** 2 / (power * own_power)
-            known = usable[some, None] & around & (sizes != 0)
-            ratio[some, c] = np.where(known, mean, np.nan)
-            found = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
-            coherence[some, c] = np.where(around, found, 0.0)
+        padded, place = _padded(csm[some], dims)
+        shape = n_sensors, len(thirds), d * d, len(padded)
+        towards = np.ascontiguousarray(padded[:, :, :, thirds].transpose(1, 3, 2, 4, 0))
+        within = np.einsum("fjdje->jdef", padded).real.reshape(n_sensors, d * d, -1)
+        # by sensor, the third, channel and frequency: few terms each, unlike whole matrices
+        flat = by_two.reshape(*shape[:2], n_channels, d * d)
+        among = (flat @ towards.reshape(shape).view(np.float64)).view(np.complex128)
+        among[thirds, at] = 0.0  # the third is another
+        rows = padded.reshape(len(padded), -1, n_sensors, d)[:, place]
+        crossed = (rows * combined).sum(axis=3).transpose(2, 1, 0)
+        power = np.maximum(np.einsum("fcc->cf", csm[some]).real, 0.0)
+        own_power = by_own @ within
+        with np.errstate(invalid="ignore", divide="ignore"):
+            inverse = np.where(own_power > 0, 1 / own_power, 0.0)[thirds]
+            sizes = np.einsum("jtcf,tcf->jcf", among.real**2 + among.imag**2, inverse)
+            mean = np.einsum("jtcf,tcf->jcf", among.conj(), crossed[thirds] * inverse) / sizes
+            found = np.abs(crossed) ** 2 / (power * own_power)
+        known = usable[some, None, None] & around & (sizes != 0).transpose(2, 1, 0)
+        ratio[some] = np.where(known, mean.transpose(2, 1, 0), np.nan)
+        found = np.where(np.isfinite(found), np.clip(found, 0.0, 1.0), 0.0)
+        coherence[some] = np.where(around, found.transpose(2, 1, 0), 0.0)
     return ChannelResponses(frequency, ratio, coherence)
 
 
-def _padded(csm: ComplexArray, dims: tuple[int, ...]) -> ComplexArray:
+def _padded(csm: ComplexArray, dims: tuple[int, ...]) -> tuple[ComplexArray, IntArray]:
     """Return matrices, (n_freqs, n_sensors, d, n_sensors, d), in which all sensors have d channels.
 
-    Those of smaller sensors are followed by channels without power.
+    And the places of the channels: those of smaller sensors are followed by some without power.
     """
     n_sensors, d = len(dims), max(dims)
+    place = np.concatenate([j * d + np.arange(n) for j, n in enumerate(dims)])
     if min(dims) < d:
-        place = np.concatenate([j * d + np.arange(n) for j, n in enumerate(dims)])
         padded = np.zeros((len(csm), n_sensors * d, n_sensors * d), np.complex128)
         padded[:, place[:, None], place] = csm
         csm = padded
-    return csm.reshape(len(csm), n_sensors, d, n_sensors, d)
+    return csm.reshape(len(csm), n_sensors, d, n_sensors, d), place
 
 
-def _predictions(
-    towards: ComplexArray,
-    own: ComplexArray,
-    combined: FloatArray,
-    dims: tuple[int, ...],
-    thirds: IntArray,
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return cross-spectra of a channel with its predictions, and of these with some of them.
-
-    `towards`, shape (n_freqs, n_sensors, d, n_thirds, d), is `_padded` by the `thirds`.
-    Sums over the few channels of a sensor: products of whole matrices would take most terms for
-    nothing.
-    """
-    crossed = np.add.reduceat(
-        own * np.concatenate([by[:n] for by, n in zip(combined, dims, strict=True)]),
-        np.cumsum([0, *dims[:-1]]),
-        axis=1,
-    )
-    columns = towards[..., 0] * combined[thirds, 0]
-    for more in range(1, combined.shape[1]):
-        columns += towards[..., more] * combined[thirds, more]
-    among = columns[:, :, 0] * combined[:, 0, None]
-    for more in range(1, combined.shape[1]):
-        among += columns[:, :, more] * combined[:, more, None]
-    return np.asarray(crossed), np.asarray(among)
-
-
-def _directions(
-    csm: ComplexArray, dims: tuple[int, ...], own: list[np.ndarray]
-) -> dict[tuple[int, int], FloatArray]:
+def _directions(csm: ComplexArray, dims: tuple[int, ...], own: list[np.ndarray]) -> FloatArray:
     """Return the real combinations of a sensor's channels that predict a channel, up to a factor.
+
+    By each sensor, of as many channels as the largest has: zero for the others. Shape (n_channels,
+    n_sensors, max(dims)).
 
     This is the main direction of the rows ``S_ck S_jk^-1`` of the relative response over all
     frequencies, weighted by signal-to-noise ratio; complex factors do not change it.
@@ -298,15 +274,15 @@ def _directions(
     sensor = np.repeat(np.arange(len(dims)), dims)
     moments = [np.zeros((len(sensor), d, d)) for d in dims]
     seen = np.zeros((len(sensor), len(dims)), np.bool_)
-    for block in blocks(len(some), 2 * len(sensor)):  # several times their matrices exist
+    for block in blocks(len(some), len(sensor)):
         for j, (moment, weighted) in enumerate(_moments(csm[some[block]], dims, own)):
             moments[j] += moment
             seen[:, j] |= weighted
-    found: dict[tuple[int, int], FloatArray] = {}
+    found = np.zeros((len(sensor), len(dims), max(dims)))
     for j, moment in enumerate(moments):
         enough = (sensor != j) & (len(sensor) - np.array(dims)[sensor] - dims[j] >= dims[j])
-        for c in np.flatnonzero(enough & seen[:, j]).tolist():
-            found[c, j] = np.linalg.eigh(moment[c])[1][:, -1]
+        some = np.flatnonzero(enough & seen[:, j])
+        found[some, j, : dims[j]] = np.linalg.eigh(moment[some])[1][:, :, -1]
     return found
 
 
