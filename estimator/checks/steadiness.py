@@ -246,10 +246,12 @@ class _Piece:
         first = others[0].start
         felt = self.along[:, first : others[-1].stop] @ self.motion
         felt = felt @ self.along[:, one].conj().swapaxes(1, 2)
-        found = [
-            _products(self.beside[:, one, each], felt[:, :, each.start - first : each.stop - first])
-            for each in others
-        ]
+        found = []
+        for d, alike in itertools.groupby(others, lambda each: each.stop - each.start):
+            columns = list(alike)
+            some = slice(columns[0].start, columns[-1].stop)
+            towards = felt[:, :, some.start - first : some.stop - first]
+            found.append(_products(self.beside[:, one, some], towards, d))
         return np.concatenate(found, axis=2) * self.weight[:, None, None]
 
     def weighted_motion(self) -> ComplexArray:
@@ -419,18 +421,20 @@ def _within(dims: Sequence[int]) -> tuple[IntArray, IntArray]:
     return to, of
 
 
-def _products(beside: ComplexArray, motion: ComplexArray) -> FloatArray:
+def _products(beside: ComplexArray, motion: ComplexArray, d: int) -> FloatArray:
     """Return real parts of ``beside[f, a, c] motion[k, f, e, b]``, summed over f.
 
-    As [k, (a, b), (c, e)]: by a matrix product of the real and imaginary parts of all frequencies.
+    As [k, (a, b), (c, e)], for c and e of one sensor of d channels: by a matrix product for each of
+    the real and imaginary parts of all frequencies.
     """
-    n_parts, n_bins, e, b = motion.shape
-    _, a, c = beside.shape
-    left = np.concatenate([beside.real, -beside.imag]).reshape(2 * n_bins, a * c)
-    right = np.concatenate([motion.real, motion.imag], axis=1).swapaxes(0, 1)
-    found = left.T @ right.reshape(2 * n_bins, -1)
-    found = found.reshape(a, c, n_parts, e, b).transpose(2, 0, 4, 1, 3)
-    return np.asarray(found.reshape(n_parts, a * b, c * e))
+    n_parts, n_bins, p, b = motion.shape
+    a, n = beside.shape[1], p // d
+    left = np.concatenate([beside.real, -beside.imag]).reshape(2 * n_bins, a, n, d)
+    right = np.concatenate([motion.real, motion.imag], axis=1).reshape(n_parts, -1, n, d, b)
+    left = left.transpose(2, 1, 3, 0).reshape(n, a * d, -1)
+    found = left @ right.transpose(2, 1, 0, 3, 4).reshape(n, 2 * n_bins, -1)
+    found = found.reshape(n, a, d, n_parts, d, b).transpose(3, 1, 5, 0, 2, 4)
+    return np.asarray(found.reshape(n_parts, a * b, p * d))
 
 
 def _chi_squared(score: FloatArray, information: FloatArray) -> tuple[float, float]:
