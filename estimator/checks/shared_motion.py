@@ -236,9 +236,9 @@ def may_have_moved(share: FloatArray) -> bool:
     """
     share = np.nan_to_num(share)  # of sensors without signal
     for sensor in range(len(share)):
-        others = [each for each in range(len(share)) if each != sensor]
-        most = max((share[j, k] for j, k in combinations(others, 2)), default=0.0)
-        if most >= MIN_SHARED and min(share[sensor, each] for each in others) < LESS * most:
+        rest = np.delete(np.delete(share, sensor, axis=0), sensor, axis=1)
+        most = float(rest.max(initial=0.0))
+        if most >= MIN_SHARED and np.delete(share[sensor], sensor).min() < LESS * most:
             return True
     return False
 
