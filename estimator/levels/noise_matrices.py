@@ -6,9 +6,13 @@ the motion; `estimator.likelihood.factor_analysis` and `estimator.levels.pooled`
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
+
+_Information = TypeVar("_Information", "FloatArray", "ComplexArray")
 
 MANY = 8
 """Sensors with equal numbers of channels from which information is inverted sensor by sensor."""
@@ -36,17 +40,19 @@ def coupling(Q: ComplexArray, a: IntArray, b: IntArray) -> ComplexArray:
     return np.asarray(Q[:, a[:, None], a] * Q[:, b[:, None], b].conj())
 
 
-def inverse(J: ComplexArray) -> ComplexArray:
-    """Invert information matrices, scaled to a unit diagonal."""
-    scaled, D = _scaled(J)
-    return np.asarray(np.linalg.inv(scaled) / (D[:, :, None] * D[:, None, :]))
+def solved(J: ComplexArray | FloatArray, wanted: ComplexArray) -> ComplexArray:
+    """Solve with information on elements of the noise, shapes (n, m, m) and (n, m)."""
+    scaled, per = _scaled(J)
+    by = (wanted if np.iscomplexobj(J) else wanted.real) * per
+    return np.asarray(np.linalg.solve(scaled, by[:, :, None])[:, :, 0] * per, np.complex128)
 
 
-def _scaled(J: ComplexArray) -> tuple[ComplexArray, FloatArray]:
-    D = np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
-    scaled = J / (D[:, :, None] * D[:, None, :])
+def _scaled(J: _Information) -> tuple[_Information, FloatArray]:
+    """Return information with a unit diagonal, and what it is multiplied by on either side."""
+    per = 1 / np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
+    scaled: _Information = J * (per[:, :, None] * per[:, None, :])
     np.einsum("bii->bi", scaled)[:] += _RIDGE
-    return scaled, D
+    return scaled, per
 
 
 def are_many(sensor: IntArray) -> bool:
@@ -81,7 +87,7 @@ def weights_beside(
 ) -> ComplexArray:
     """Return the weights of elements of the noise beside motion in every channel's noise.
 
-    These are ``L_ia conj(L_ib)``, multiplied by the `inverse` of `coupling_beside`.
+    These are ``L_ia conj(L_ib)``, multiplied by the inverse of `coupling_beside`.
 
     Parameters
     ----------
@@ -130,10 +136,10 @@ def weights_beside(
 
 def _solved(root: ComplexArray, at: IntArray, U: ComplexArray, sensor: IntArray) -> ComplexArray:
     a, b = pairs(sensor)
-    scaled, D = _scaled(coupling_beside(U, sensor))
-    rows = (root[:, :, a] * root[:, :, b].conj())[at] / D[:, None]
+    scaled, per = _scaled(coupling_beside(U, sensor))
+    rows = (root[:, :, a] * root[:, :, b].conj())[at] * per[:, None]
     found = np.linalg.solve(scaled.swapaxes(1, 2), rows.swapaxes(1, 2))
-    return np.asarray(found.swapaxes(1, 2) / D[:, None])
+    return np.asarray(found.swapaxes(1, 2) * per[:, None])
 
 
 def mean_coupling(
@@ -211,10 +217,13 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
     C[:, at, sensor] = 0
     rows = projected.reshape(n, n_sensors, d, p)
 
-    def by_g(x: ComplexArray) -> ComplexArray:
+    def by_c(x: ComplexArray) -> ComplexArray:
         of = x.reshape(n, p, d, n_sensors, d)
         xC = sum(of[..., k, None] * C[:, :, None, :, k] for k in range(d))
-        return np.asarray((np.reshape(xC, (n, p * d, p)) @ projected).reshape(n, p, d, p))
+        return np.reshape(xC, (n, p * d, p))
+
+    def by_g(x: ComplexArray) -> ComplexArray:
+        return np.asarray((by_c(x) @ projected).reshape(n, p, d, p))
 
     f = C.swapaxes(3, 4).reshape(n, p, len(a)).astype(np.complex64)
     among = coupling(projected.astype(np.complex64), a, b)
@@ -228,8 +237,8 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
     a0 = of_own(chain)
     chain = by_g(chain)
     a1 = of_own(chain)
-    chain = by_g(chain)
-    a2, square = of_own(chain), a0 @ a0
+    own_columns = by_c(chain).reshape(n, n_sensors, d * d, p) @ rows.conj().swapaxes(2, 3)
+    a2, square = own_columns.reshape(a0.shape), a0 @ a0
     found = np.stack(
         [
             first + 2 * _along(a1, one) + _along(a0, a0),
@@ -241,7 +250,7 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
         ]
     )
     if (np.maximum(first, 0) ** 1.5 > NEGLIGIBLE * found[0] ** 1.5).any():
-        found[2] += 4 * _along(of_own(by_g(chain)), one)
+        found[2] += 4 * _along(of_own(by_g(by_g(chain))), one)
         g = (C @ rows[:, None]).reshape(n, p, p, p)
         twice = g @ g
         found[1] += _along(g, twice)

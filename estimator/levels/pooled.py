@@ -42,11 +42,11 @@ from estimator.levels.noise_matrices import (
     WHOLE,
     are_many,
     axes_of,
-    inverse,
     inverse_of_sensors,
     leading,
     mean_coupling,
     pairs,
+    solved,
     times,
     traces,
     weights_beside,
@@ -425,7 +425,7 @@ def _fitted(
         rest = without(X, U)
         loss = 1 + weakly / np.maximum(shown.averages - q, 1.0)
         y = g[:, None] * rest[:, a, b]
-        noise = loss[:, None] * times(inverse(_mean_coupling(U, Q, parts, sensor)), parts.mean(y))
+        noise = loss[:, None] * solved(_mean_coupling(U, Q, parts, sensor), parts.mean(y))
         size, axes = axes_of(noise, _least(X, Q, parts), sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
         turn += 1
@@ -685,12 +685,14 @@ def _resolved(
     """
     p, most, here = X.shape[1], int(q.max()), parts.block
     columns = np.arange(most)[::-1]
-    axes = _axes(X, most + 1)
+    axes = _axes(X, most)
     power = (axes.conj() * (X @ axes)).real.sum(axis=1)
     edge = _edge(p, parts)
     stands = power > edge[:, None]
-    more = stands[np.arange(len(X)), most - q[here]]
-    whole = ~more & (stands[:, 1:].sum(axis=1) == q[here]) & (r < q)[here]
+    more = stands.sum(axis=1) > q[here]
+    at = np.flatnonzero(q[here] == most)
+    more[at] = _are_above(without(X[at], axes[at]), edge[at])
+    whole = ~more & (stands.sum(axis=1) == q[here]) & (r < q)[here]
     whole &= not are_many(sensor)  # it would cost too much
     for i in range(int(sensor[-1]) + 1):
         at = np.flatnonzero(whole)
@@ -698,9 +700,9 @@ def _resolved(
         w = np.linalg.eigvalsh(X[at][:, others[:, None], others])
         whole[at] = w[np.arange(len(at)), -np.minimum(q[here[at]], len(others))] > edge[at]
     number = np.where(whole, q[here], r[here])
-    stands = stands[:, 1:] & (columns < number[:, None])
-    U, n_own = axes[:, :, 1:] * stands[:, None], stands.sum(axis=1)
-    _leave_lines(U, n_own, X, power[:, 1:], edge=edge, more=more, parts=parts, sensor=sensor)
+    stands &= columns < number[:, None]
+    U, n_own = axes * stands[:, None], stands.sum(axis=1)
+    _leave_lines(U, n_own, X, power, edge=edge, more=more, parts=parts, sensor=sensor)
     there = (np.abs(U) ** 2).sum(axis=1)
     along = (U.conj() * (X @ U)).real.sum(axis=1) - there
     taken = _taken(np.where(there > 0.5, np.maximum(along, _FLOOR), 0.0), OUTSTANDING - 1)
@@ -713,6 +715,18 @@ def _resolved(
         beside = (np.arange(most) + n_own[at, None]) % most
         U[at] = U[at] + np.take_along_axis(_strongest(rest, lacks[at]), beside[:, None], axis=2)
     return U, n_own, taken
+
+
+def _are_above(matrices: ComplexArray, edge: FloatArray) -> BoolArray:
+    """Return whether Hermitian matrices have an eigenvalue above an edge, shape (n,).
+
+    Where none has, factors of Cholesky prove it.
+    """
+    try:
+        np.linalg.cholesky(edge[:, None, None] * np.eye(matrices.shape[1]) - matrices)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.eigvalsh(matrices)[:, -1] > edge)
+    return np.zeros(len(matrices), np.bool_)
 
 
 def _taken(power: FloatArray, least: FloatArray | float) -> FloatArray:

@@ -27,7 +27,14 @@ from typing import Any
 import numpy as np
 
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
-from estimator.levels.noise_matrices import WHOLE, axes_of, coupling_beside, leading, pairs
+from estimator.levels.noise_matrices import (
+    WHOLE,
+    axes_of,
+    coupling_beside,
+    leading,
+    pairs,
+    solved,
+)
 from estimator.self_noise.coherency import TOLERANCE, blocks
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -37,7 +44,6 @@ _LEAST = 0.05  # of the noise in any direction, over that before the step
 _DAMPING, _DAMPED, _MOST = 1e-3, 10.0, 1e6  # of steps that gain nothing: first, more, last
 _FALLING = 0.1  # of the noise at first: from there directions are tried at zero
 _AT_BOUND = 0.5  # of the bound of zero over the noise
-_RIDGE = 1e-10  # of the diagonal, added to information
 _HELD = 8  # rounds in which directions are held at their bounds, and let go
 MAX_ITERATIONS = 200
 DECREMENT = 1e-7
@@ -532,7 +538,7 @@ def scoring(
     toward = rest - beside
     if penalty is not None:
         toward[:, i, i] -= np.log(np.abs(at.root[:, i, i]) ** 2) @ penalty
-    change = _solved(_damped(U, beside, sensor, damping, penalty), toward[:, a, b])
+    change = solved(_damped(U, beside, sensor, damping, penalty), toward[:, a, b])
     size, axes = axes_of(change + (a == b), np.full((n, p), -np.inf), sensor)
     low = np.full((n, p), _LEAST)
     doubtful = np.flatnonzero(held.any(axis=1) | (size < _LEAST).any(axis=1))
@@ -567,16 +573,6 @@ def scoring(
     falling = (fixed & (low != _LEAST) & (low < _AT_BOUND)).any(axis=1)
     decrement = np.where(falling, np.maximum(decrement, DECREMENT), decrement)
     return size, axes, decrement, fixed
-
-
-def _solved(J: ComplexArray | FloatArray, wanted: ComplexArray) -> ComplexArray:
-    """Solve with information on the noise, scaled to a unit diagonal."""
-    i = np.arange(J.shape[1])
-    unit = np.sqrt(np.maximum(J[:, i, i].real, 1e-30))
-    scaled = J / (unit[:, :, None] * unit[:, None, :])
-    scaled[:, i, i] += _RIDGE
-    by = (wanted if np.iscomplexobj(J) else wanted.real) / unit
-    return np.asarray(np.linalg.solve(scaled, by[:, :, None])[:, :, 0] / unit, np.complex128)
 
 
 def _damped(
@@ -635,7 +631,7 @@ def _bounded(
         value = np.where(held[some][:, a] & (a == b), low[some][:, a] - 1, 0.0)
         free = np.where(fixed, value, wanted - (J @ value[:, :, None])[:, :, 0])
         alone = np.where(fixed[:, :, None] | fixed[:, None], np.eye(len(a)) * fixed[:, None], J)
-        change = _solved(alone, free)
+        change = solved(alone, free)
         rise = (wanted - (J @ change[:, :, None])[:, :, 0])[:, diagonal].real * held[some]
         most = rise.max(axis=1, keepdims=True)
         let_go[some] = most[:, 0] > DECREMENT
@@ -666,9 +662,9 @@ class _Given:
         if not with_motion:  # the maximum
             alone = np.where(self._within, self.matrix, 0.0)
         else:
-            alone = np.linalg.inv(np.where(self._within, self.precision, 0.0))
+            alone = _inverse(np.where(self._within, self.precision, 0.0), self._sensor)
             alone = (alone + alone.conj().swapaxes(1, 2)) / 2
-        return np.asarray(np.linalg.cholesky(alone), np.complex128)
+        return np.sqrt(alone) if are_single(self._sensor) else np.linalg.cholesky(alone)
 
     def whitened(
         self, root: ComplexArray, guess: ComplexArray | None, q: int, rows: IntArray
