@@ -449,12 +449,12 @@ def _condition(
     """
     a, b = (slice(sum(dims[:sensor]), sum(dims[: sensor + 1])) for sensor in (j, k))
     between = matrix[:, a, b][valid]
-    if min(dims[j], dims[k]) == 1:  # of one singular value, the norm
-        singular = np.linalg.norm(between, axis=(1, 2))[:, None]
-    else:
-        singular = np.linalg.svd(between, compute_uv=False)
-    least, found = singular[:, -1], np.full(len(matrix), np.nan)
-    found[valid] = np.where(least > 0, singular[:, 0] / np.where(least > 0, least, 1.0), np.inf)
+    # by roots of eigenvalues, at half the cost of singular values
+    squares = np.linalg.eigvalsh(between @ between.conj().swapaxes(1, 2))
+    squares = squares[:, max(dims[j] - dims[k], 0) :]
+    least, found = np.sqrt(np.maximum(squares[:, 0], 0.0)), np.full(len(matrix), np.nan)
+    found[valid] = np.sqrt(squares[:, -1]) / np.where(least > 0, least, 1.0)
+    found[np.flatnonzero(valid)[least == 0]] = np.inf
     return found
 
 
