@@ -77,6 +77,7 @@ class CanonicalCoherence:
         self._rows = np.flatnonzero(self.usable)
         self._roots: dict[tuple[int, ...], ComplexArray] = {}
         self._found: dict[frozenset[tuple[int, ...]], FloatArray] = {}
+        self._means: dict[frozenset[tuple[int, ...]], FloatArray] = {}
 
     def between(
         self,
@@ -111,10 +112,27 @@ class CanonicalCoherence:
         pair = frozenset((one, two))
         if pair not in self._found:
             found = np.zeros((self._n_freqs, len(one)))
-            towards = _part(self._csm, self._rows, one, two)
-            found[self.usable] = _squares(towards, self._root(one), self._root(two))
+            found[self.usable] = _squares(*self._whitened(one, two))
             self._found[pair] = np.clip(found, 0.0, 1.0)
         return self._found[pair]
+
+    def mean(self, first: range | IntArray, second: range | IntArray) -> FloatArray:
+        """Return the mean of `between` over its directions, shape (n_freqs,): from a trace."""
+        one, two = sorted((tuple(first), tuple(second)), key=len)
+        pair = frozenset((one, two))
+        if pair not in self._means:
+            found = np.zeros(self._n_freqs)
+            towards, root_one, root_two = self._whitened(one, two)
+            square = np.linalg.norm(root_one @ towards @ root_two, axis=(1, 2)) ** 2
+            found[self.usable] = np.clip(square / len(one), 0.0, 1.0)
+            self._means[pair] = found
+        return self._means[pair]
+
+    def _whitened(
+        self, one: tuple[int, ...], two: tuple[int, ...]
+    ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return the cross-spectra of two groups, and what whitens them on either side."""
+        return _part(self._csm, self._rows, one, two), self._root(one), self._root(two)
 
     def _root(self, channels: tuple[int, ...]) -> ComplexArray:
         """Return the inverse root of a group's matrix, cached."""
@@ -195,7 +213,7 @@ def shared_motion(
     if n_effective <= 2 * max(dims, default=0):
         return share
     for j, k in combinations(range(len(dims)), 2):
-        found = canonical.between(own_channels(dims, j), own_channels(dims, k))[inside]
+        found = canonical.mean(own_channels(dims, j), own_channels(dims, k))[inside]
         chance = max(dims[j], dims[k]) / n_effective
         share[j, k] = share[k, j] = (float(found.mean()) - chance) / (1 - chance)
     return share
@@ -376,10 +394,12 @@ def significant_dimensions(
     ``-2 (n - (d_j + d_k) / 2) sum ln(1 - g)`` has ``2 (d_j - r) (d_k - r)`` degrees of freedom.
     """
     pairs = list(combinations(range(len(dims)), 2))
-    found = np.zeros(len(canonical.usable))
+    found, most = np.zeros(len(canonical.usable)), min(sorted(dims)[-2:], default=0)
     if not pairs or n_effective <= 2 * max(dims):
         return np.full(len(found), np.nan)
     for j, k in pairs:
+        if (found[canonical.usable] >= most).all():
+            break
         coherence = np.minimum(
             canonical.between(own_channels(dims, j), own_channels(dims, k)), 1 - 1e-15
         )
