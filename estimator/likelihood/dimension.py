@@ -59,6 +59,8 @@ HOPELESS = 1e-12
 LOOK_STEPS, BEYOND_DOUBT = 4, 2.0
 """Steps of its fits of fewer dimensions than usual, of which a wrong model needs ten times more;
 and by what the statistic is divided that is then hopeless. It is up to 1.3 times the last one."""
+LOOK_CHANNELS = 15
+"""Channels whose sensors alone are looked at before all: what they reject, all reject."""
 
 
 OVERFIT = 1.15
@@ -449,14 +451,23 @@ class _Search:
         self._n_effective = n_effective
         self._expected = 1 / psd  # in units of the coherency matrix
 
-    def fit(self, q: int, some: list[int], *, every: int = 1, most: int | None = None) -> _Fit:
+    def fit(
+        self,
+        q: int,
+        some: list[int],
+        *,
+        every: int = 1,
+        most: int | None = None,
+        channels: IntArray | None = None,
+    ) -> _Fit:
         """Maximise the likelihood of q factors in these bands, at every so many frequencies.
 
-        In `most` steps, where that is stated.
+        In `most` steps and of some channels alone, where that is stated.
         """
         rows = np.flatnonzero(np.isin(self._number, some))[every // 2 :: every]
         if most is not None:
-            maximum = maximise(self._matrix[rows], q, most=most)
+            at = np.arange(self._matrix.shape[1]) if channels is None else channels
+            maximum = maximise(self._matrix[rows[:, None, None], at[:, None], at], q, most=most)
         elif q <= self._usual:
             maximum = self._maxima.maximise(self._matrix[rows], q)
         else:
@@ -467,7 +478,7 @@ class _Search:
                 kind=self._kind,
                 n_effective=self._n_effective,
             )
-        if q <= self._usual + 1:
+        if most is None and q <= self._usual + 1:
             for b in some:
                 here = self._number[rows] == b
                 self.axes[b] = maximum.eigenvectors[here]
@@ -527,12 +538,19 @@ class _Search:
     ) -> dict[int, goodness_of_fit.BandTest]:
         """Return the tests of bands that few of their frequencies reject beyond doubt."""
         found: dict[int, goodness_of_fit.BandTest] = {}
-        few = ((LOOK_STEPS, BEYOND_DOUBT),) if q < self._usual else ()
-        for most, beyond in (*few, (None, 1.0)):
+        sensor = np.repeat(np.arange(len(self._dims)), self._dims)
+        every = -(-len(sensor) // LOOK_CHANNELS)
+        few = np.flatnonzero(sensor % every == 0)
+        looks: list[tuple[IntArray | None, int | None, float]] = [(None, None, 1.0)]
+        if q < self._usual:
+            looks.insert(0, (None, LOOK_STEPS, BEYOND_DOUBT))
+            if every > 1 and (len(few) - q) ** 2 > EQUATIONS * len(few):
+                looks.insert(0, (few, LOOK_STEPS, BEYOND_DOUBT))
+        for channels, most, beyond in looks:
             left = [b for b in some if b not in found]
             if not left:
                 break
-            look = self.fit(q, left, every=FIRST_LOOK, most=most)
+            look = self.fit(q, left, every=FIRST_LOOK, most=most, channels=channels)
             for b in left:
                 distant = neighbours[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
                 test = goodness_of_fit.pool(look.test, look.number == b, neighbours=distant)
