@@ -431,8 +431,10 @@ def _products(beside: ComplexArray, motion: ComplexArray, d: int) -> FloatArray:
     a, n = beside.shape[1], p // d
     left = np.concatenate([beside.real, -beside.imag]).reshape(2 * n_bins, a, n, d)
     right = np.concatenate([motion.real, motion.imag], axis=1).reshape(n_parts, -1, n, d, b)
-    left = left.transpose(2, 1, 3, 0).reshape(n, a * d, -1)
-    found = left @ right.transpose(2, 1, 0, 3, 4).reshape(n, 2 * n_bins, -1)
+    found = np.matmul(
+        left.transpose(2, 1, 3, 0).reshape(n, a * d, -1),
+        right.transpose(2, 1, 0, 3, 4).reshape(n, 2 * n_bins, -1),
+    )
     found = found.reshape(n, a, d, n_parts, d, b).transpose(3, 1, 5, 0, 2, 4)
     return np.asarray(found.reshape(n_parts, a * b, p * d))
 

@@ -6,13 +6,11 @@ the motion; `estimator.likelihood.factor_analysis` and `estimator.levels.pooled`
 
 from __future__ import annotations
 
-from typing import TypeVar
+from collections.abc import Iterator
 
 import numpy as np
 
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
-
-_Information = TypeVar("_Information", "FloatArray", "ComplexArray")
 
 MANY = 8
 """Sensors with equal numbers of channels from which information is inverted sensor by sensor."""
@@ -47,10 +45,10 @@ def solved(J: ComplexArray | FloatArray, wanted: ComplexArray) -> ComplexArray:
     return np.asarray(np.linalg.solve(scaled, by[:, :, None])[:, :, 0] * per, np.complex128)
 
 
-def _scaled(J: _Information) -> tuple[_Information, FloatArray]:
+def _scaled(J: ComplexArray | FloatArray) -> tuple[ComplexArray | FloatArray, FloatArray]:
     """Return information with a unit diagonal, and what it is multiplied by on either side."""
     per = 1 / np.sqrt(np.maximum(np.einsum("bii->bi", J).real, 1e-30))
-    scaled: _Information = J * (per[:, :, None] * per[:, None, :])
+    scaled = np.asarray(J * (per[:, :, None] * per[:, None, :]))
     np.einsum("bii->bi", scaled)[:] += _RIDGE
     return scaled, per
 
@@ -199,7 +197,7 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
     of single precision.
     """
     n, p = weight.shape[:2]
-    a, b = pairs(sensor)
+    a = pairs(sensor)[0]
     if not are_many(sensor):
         B = np.empty((n, p, p, p), np.complex128)
         for i, d in enumerate(np.bincount(sensor).tolist()):
@@ -215,30 +213,20 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
     C = (C + C.conj().swapaxes(3, 4)) / 2
     own = C[:, at, sensor]
     C[:, at, sensor] = 0
-    rows = projected.reshape(n, n_sensors, d, p)
+    rows = projected.reshape(n, n_sensors, d, p)[:, sensor]
 
     def by_c(x: ComplexArray) -> ComplexArray:
         of = x.reshape(n, p, d, n_sensors, d)
         xC = sum(of[..., k, None] * C[:, :, None, :, k] for k in range(d))
-        return np.reshape(xC, (n, p * d, p))
+        return np.reshape(xC, (n, p, d, p))
 
-    def by_g(x: ComplexArray) -> ComplexArray:
-        return np.asarray((by_c(x) @ projected).reshape(n, p, d, p))
-
-    f = C.swapaxes(3, 4).reshape(n, p, len(a)).astype(np.complex64)
-    among = coupling(projected.astype(np.complex64), a, b)
-    first = np.einsum("npm,npm->np", f @ among, f.conj()).real.astype(np.float64)
-    one = np.eye(d)
-
-    def of_own(x: ComplexArray) -> ComplexArray:
-        return np.asarray(x.reshape(n, p, d, n_sensors, d)[:, at, :, sensor].swapaxes(0, 1))
-
-    chain = own @ rows[:, sensor]
-    a0 = of_own(chain)
-    chain = by_g(chain)
-    a1 = of_own(chain)
-    own_columns = by_c(chain).reshape(n, n_sensors, d * d, p) @ rows.conj().swapaxes(2, 3)
-    a2, square = own_columns.reshape(a0.shape), a0 @ a0
+    # as Y is Hermitian, of rows y of Y: a_1 = C y_C y*, a_2 = C y_C Y y_C*, where y_C = y C
+    first, one = _first(C.real - C.imag, projected), np.eye(d)
+    ahead = by_c(rows)
+    beyond = (ahead.reshape(n, p * d, p) @ projected).reshape(n, p, d, p)
+    a0 = own @ rows.reshape(n, p, d, n_sensors, d)[:, at, :, sensor].swapaxes(0, 1)
+    a1, a2 = own @ _by_adjoint(ahead, rows), own @ _by_adjoint(beyond, ahead)
+    square = a0 @ a0
     found = np.stack(
         [
             first + 2 * _along(a1, one) + _along(a0, a0),
@@ -250,12 +238,35 @@ def traces(weight: ComplexArray, projected: ComplexArray, sensor: IntArray) -> F
         ]
     )
     if (np.maximum(first, 0) ** 1.5 > NEGLIGIBLE * found[0] ** 1.5).any():
-        found[2] += 4 * _along(of_own(by_g(by_g(chain))), one)
-        g = (C @ rows[:, None]).reshape(n, p, p, p)
+        found[2] += 4 * _along(own @ _by_adjoint(by_c(beyond), beyond), one)
+        g = (C @ projected.reshape(n, 1, n_sensors, d, p)).reshape(n, p, p, p)
         twice = g @ g
         found[1] += _along(g, twice)
         found[2] += _along(twice, twice)
     return found
+
+
+def _first(C: FloatArray, projected: ComplexArray) -> FloatArray:
+    """Return ``tr(g**2)`` of `traces`, shape (n, p), as a form of real numbers.
+
+    `C`, shape (n, p, n_sensors, d, d), is the difference of real and imaginary parts, of which
+    Hermitian matrices consist.
+    """
+    n, p, n_sensors, d = C.shape[:4]
+    y = projected.astype(np.complex64).reshape(n, n_sensors, d, n_sensors, d).swapaxes(3, 4)
+    re, im = (np.ascontiguousarray(each)[:, :, :, None, :, None] for each in (y.real, y.imag))
+    re_b, im_b = re.swapaxes(2, 3).swapaxes(4, 5), im.swapaxes(2, 3).swapaxes(4, 5)
+    form = re * re_b
+    form += im * im_b
+    form += (re * im_b - im * re_b).swapaxes(4, 5)
+    C = C.astype(np.float32)
+    left = C.reshape(n, p, -1) @ form.reshape(n, n_sensors * d * d, -1)
+    right = C.transpose(0, 1, 3, 4, 2).reshape(n, p, -1)
+    return np.asarray(np.einsum("npm,npm->np", left, right), np.float64)
+
+
+def _by_adjoint(one: ComplexArray, other: ComplexArray) -> ComplexArray:
+    return np.asarray(one @ other.conj().swapaxes(2, 3))
 
 
 def _along(one: ComplexArray, other: ComplexArray | FloatArray) -> FloatArray:
@@ -284,22 +295,29 @@ def axes_of(
     a, b = pairs(sensor)
     matrix[:, a, b] = noise
     size, axes = np.empty((n, p)), np.zeros((n, p, p), np.complex128)
-    for i in range(int(sensor[-1]) + 1):
-        of = np.flatnonzero(sensor == i)
-        block = matrix[:, of[:, None], of]
-        w, u = np.linalg.eigh((block + block.conj().swapaxes(1, 2)) / 2)
-        size[:, of] = np.maximum(w, floor[:, of].mean(axis=1, keepdims=True))
-        axes[:, of[:, None], of] = u
+    for rows, columns in of_sensors(sensor):
+        block, own = matrix[:, rows, columns], rows[:, :, 0]
+        w, axes[:, rows, columns] = np.linalg.eigh((block + block.conj().swapaxes(2, 3)) / 2)
+        size[:, own] = np.maximum(w, floor[:, own].mean(axis=2, keepdims=True))
     return size, axes
+
+
+def of_sensors(sensor: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield rows and columns of the matrices of sensors, those of one size together.
+
+    Shapes (n_sensors, d, 1) and (n_sensors, 1, d).
+    """
+    counts = np.bincount(sensor)[sensor]
+    for d in sorted(set(counts.tolist())):
+        rows = np.flatnonzero(counts == d).reshape(-1, d, 1)
+        yield rows, rows.swapaxes(1, 2)
 
 
 def inverse_of_sensors(matrix: ComplexArray, sensor: IntArray) -> ComplexArray:
     """Return the inverse of what each sensor has by itself, zero between sensors."""
-    if not are_many(sensor):
-        return np.asarray(np.linalg.inv(np.where(sensor[:, None] == sensor, matrix, 0)))
-    rows = np.arange(len(sensor)).reshape(int(sensor[-1]) + 1, -1, 1)
     found = np.zeros_like(matrix)
-    found[:, rows, rows.swapaxes(1, 2)] = np.linalg.inv(matrix[:, rows, rows.swapaxes(1, 2)])
+    for rows, columns in of_sensors(sensor):
+        found[:, rows, columns] = np.linalg.inv(matrix[:, rows, columns])
     return found
 
 

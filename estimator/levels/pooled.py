@@ -45,6 +45,7 @@ from estimator.levels.noise_matrices import (
     inverse_of_sensors,
     leading,
     mean_coupling,
+    of_sensors,
     pairs,
     solved,
     times,
@@ -546,7 +547,6 @@ def _of_neighbours(
     adjoint = turn.conj().swapaxes(2, 3)
     whole = np.stack([turn @ T @ adjoint, turn @ projector @ adjoint, turn @ adjoint])
     power = np.maximum(np.linalg.eigvalsh(T)[:, -1], 1.0)
-    apart = sensor[:, None] != sensor
     best = _Weak(back @ own.motion, own.number.copy(), own.clear.copy(), own.averages.copy())
     better = np.zeros(n, np.bool_)
     for reach in REACHES:
@@ -555,7 +555,7 @@ def _of_neighbours(
         worth_of = weight.sum(axis=1) ** 2 / (weight**2 / averages).sum(axis=1)
         weight /= weight.sum(axis=1, keepdims=True)
         mean, kept, noise = np.einsum("bc,mbcij->mbij", weight, whole)
-        one = _power(noise, apart, -0.5)
+        one = _power(noise, sensor, -0.5)
         with_others = _weak(
             one @ mean @ one,
             one @ kept @ one,
@@ -924,7 +924,7 @@ def _shown(
             off = np.eye(p) - u @ u.conj().swapaxes(1, 2)
             rest, kept = off @ rest @ off, off @ kept @ off
         # each sensor by itself as without motion, whatever its noise was taken for
-        alike = _power(kept, apart, 0.5) @ _power(rest, apart, -0.5)
+        alike = _power(kept, sensor, 0.5) @ _power(rest, sensor, -0.5)
         error = np.abs(white(rest, alike, sensor) - kept) ** 2
         degrees = _degrees(sensor, resolved + number)
         statistic = averages * np.where(apart, error, 0.0).sum(axis=(1, 2))
@@ -936,11 +936,15 @@ def _shown(
     return found, clear
 
 
-def _power(matrix: ComplexArray, apart: BoolArray, exponent: float) -> ComplexArray:
+def _power(matrix: ComplexArray, sensor: IntArray, exponent: float) -> ComplexArray:
     """Return a power of the matrices of each sensor by itself; rounding may leave them singular."""
-    w, u = np.linalg.eigh(np.where(apart, 0.0, matrix))
-    w = np.maximum(w, 1e-9 * np.abs(w).sum(axis=1, keepdims=True))
-    return np.asarray((u * (w**exponent)[:, None, :]) @ u.conj().swapaxes(1, 2))
+    found = np.zeros_like(matrix)
+    least = 1e-9 * np.einsum("bii->b", matrix).real[:, None, None]
+    for rows, columns in of_sensors(sensor):
+        w, u = np.linalg.eigh(matrix[:, rows, columns])
+        powers = np.maximum(w, least) ** exponent
+        found[:, rows, columns] = (u * powers[:, :, None, :]) @ u.conj().swapaxes(2, 3)
+    return found
 
 
 def _degrees(sensor: IntArray, q: IntArray) -> FloatArray:

@@ -664,7 +664,8 @@ class _Given:
         else:
             alone = _inverse(np.where(self._within, self.precision, 0.0), self._sensor)
             alone = (alone + alone.conj().swapaxes(1, 2)) / 2
-        return np.sqrt(alone) if are_single(self._sensor) else np.linalg.cholesky(alone)
+        root = np.sqrt if are_single(self._sensor) else np.linalg.cholesky
+        return np.asarray(root(alone), np.complex128)
 
     def whitened(
         self, root: ComplexArray, guess: ComplexArray | None, q: int, rows: IntArray
