@@ -401,18 +401,18 @@ def _fitted(
     while True:
         X = white(mean, whitener[own], sensor)
         U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
-        taken, weakly = np.zeros(len(own)), np.zeros(len(q))
+        taken, loss, weak = np.zeros(len(own)), np.ones(len(q)), np.zeros_like(q)
         if resolve:
             r = _n_resolved(X, parts, wanted, sensor)
             U, n_own, taken = _resolved(X, r, wanted, parts, sensor)
-        V, g = _leading(U, r[own]), N / (N - np.minimum(n_own, r[own]))
-        kept = parts.mean(np.eye(p) - V @ V.conj().swapaxes(1, 2))
-        T = parts.mean(g[:, None, None] * without(X, V)) if resolve else X
-        shown = _weak(T, kept, resolved=r, most=at_most, averages=whole, sensor=sensor)
-        amplitude = whitener / np.sqrt(unit)[:, None]
-        if common is not None:
-            shown = shown.unless(common.number >= shown.number, common, amplitude)
-        weak = np.minimum(shown.number, at_most - r)
+        is_open = bool((at_most > r).any())  # else all dimensions are resolved
+        if is_open:
+            T, kept = _without_resolved(X, _leading(U, r[own]), np.minimum(n_own, r[own]), parts)
+            shown = _weak(T, kept, resolved=r, most=at_most, averages=whole, sensor=sensor)
+            amplitude = whitener / np.sqrt(unit)[:, None]
+            if common is not None:
+                shown = shown.unless(common.number >= shown.number, common, amplitude)
+            weak = np.minimum(shown.number, at_most - r)
         q, g = r + weak, N / (N - taken)
         Q = np.eye(p) - U @ U.conj().swapaxes(1, 2)
         if weak.any():
@@ -421,17 +421,17 @@ def _fitted(
             weakly = np.where(
                 shown.clear >= CLEARLY, _taken(power, 2 * np.sqrt(p / shown.averages)), weak
             )
+            loss = 1 + weakly / np.maximum(shown.averages - q, 1.0)
             W = _strongest(Q @ A[own], np.minimum(weak[own], q[own] - n_own))
             Q, U = Q - W @ W.conj().swapaxes(1, 2), np.concatenate([U, W], axis=2)
         rest = without(X, U)
-        loss = 1 + weakly / np.maximum(shown.averages - q, 1.0)
         y = g[:, None] * rest[:, a, b]
         noise = loss[:, None] * solved(_mean_coupling(U, Q, parts, sensor), parts.mean(y))
         size, axes = axes_of(noise, _least(X, Q, parts), sensor)
         step = np.clip(np.log(size), -_STEP, _STEP)
         turn += 1
         if turn == ROUNDS or np.abs(step).max() < (RESOLVES if resolve else SETTLED):
-            if common is not None:
+            if common is not None or not is_open:
                 break
             common = _of_neighbours(
                 shown, T, kept, amplitude, resolved=r, most=at_most, averages=whole, sensor=sensor
@@ -457,6 +457,15 @@ def _fitted(
         whitener=whitener,
         level=loss[:, None] * parts.mean(times(weight, y).real),
     )
+
+
+def _without_resolved(
+    X: ComplexArray, V: ComplexArray, n_own: IntArray, parts: _Parts
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the mean matrix of each block without the directions V, and their projector's mean."""
+    gain = parts.averages / (parts.averages - n_own)
+    projector = np.eye(X.shape[1]) - V @ V.conj().swapaxes(1, 2)
+    return parts.mean(gain[:, None, None] * without(X, V)), parts.mean(projector)
 
 
 def _least(X: ComplexArray, Q: ComplexArray, parts: _Parts) -> FloatArray:
