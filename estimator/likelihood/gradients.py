@@ -329,14 +329,14 @@ def with_gradients(
     which is looked for where one motion explains it worse than usual. They have as many parameters.
     """
     d, n_sensors = dims[0], len(dims)
-    given = coherency(csm, dims)
-    if len(set(dims)) > 1 or n_sensors < MIN_SENSORS or not choices:
+    if len(set(dims)) > 1 or n_sensors < MIN_SENSORS or n_effective <= csm.shape[1]:
         return None, choices
+    if not choices or not _are_seen(choices):
+        return None, choices
+    given = coherency(csm, dims)
     kind = kinds(given, dims)
     whole = given.valid & (given.flags == 0).all(axis=1) & (frequency > 0)
-    if kind.max() >= d or n_effective <= csm.shape[1]:
-        return None, choices
-    if not _are_seen(choices):
+    if kind.max() >= d:
         return None, choices
     seen = next((n for n, each in enumerate(choices) if not _is_usual(each)), len(choices))
     top = choices[max(0, seen - 1)].high
