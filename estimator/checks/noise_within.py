@@ -9,7 +9,7 @@ import numpy as np
 from estimator.likelihood.factor_analysis import Maximum, maximise, n_noise
 from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool, rejected_below
 from estimator.self_noise.coherency import Coherency, testable
-from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 CLEARLY = 10.0
 """p value of a band beside one sensor's matrix, over that of a band that fails, from which it
@@ -49,18 +49,26 @@ def beside_matrices(
     ones = [each for each in ones if (sum(dims) - n_factors) ** 2 > n_noise(each)]
     widened = np.zeros(len(insides), np.bool_)
     found = [each.copy() for each in (model.statistic, model.degrees, model.p_value)]
-    for number, test in enumerate(tests if ones else ()):
-        if not test.p_value < rejected:
-            continue
-        rows = np.flatnonzero(insides[number] & np.isfinite(model.statistic))
-        matrix = testable(part.block(rows), frequency[rows])
-        look = matrix[:: -(-len(rows) // LOOK)]
-        least = [np.nansum(maximise(look, n_factors, dims=each).discrepancy) for each in ones]
-        fit = maximise(matrix, n_factors, dims=ones[int(np.argmin(least))])
+    failed = [n for n, test in enumerate(tests if ones else ()) if test.p_value < rejected]
+    if not failed:
+        return model, widened
+    every = [np.flatnonzero(insides[number] & np.isfinite(model.statistic)) for number in failed]
+    seen = [rows[:: -(-len(rows) // LOOK)] for rows in every]
+    edges = np.cumsum([0, *map(len, seen)]).tolist()
+
+    def fits(rows: IntArray, each: tuple[int, ...]) -> Maximum:
+        return maximise(testable(part.block(rows), frequency[rows]), n_factors, dims=each)
+
+    looks = [fits(np.concatenate(seen), each) for each in ones]  # of all bands together
+    for number, rows, look, some in zip(
+        failed, every, seen, map(slice, edges, edges[1:]), strict=False
+    ):
+        least = [np.nansum(each.discrepancy[some]) for each in looks]
+        best = int(np.argmin(least))
+        fit = looks[best].take(some) if len(look) == len(rows) else fits(rows, ones[best])
         beside = model_test(fit, n_effective=n_effective)
-        every = np.ones(len(rows), np.bool_)
-        explained = pool(beside, every, neighbours=neighbours).p_value >= CLEARLY * rejected
-        if explained and _is_noise(fit, matrix):
+        explained = pool(beside, rows >= 0, neighbours=neighbours).p_value >= CLEARLY * rejected
+        if explained and _is_noise(fit, testable(part.block(rows), frequency[rows])):
             widened[number] = True
             for each, values in zip(
                 found, (beside.statistic, beside.degrees, beside.p_value), strict=True
