@@ -297,8 +297,11 @@ def _pool(
 
     def cut(of: IntArray, k: IntArray) -> tuple[_Parts, ComplexArray]:
         parts = _parts(begin[of], sizes[of], k, averages, fewer[of])
-        summed = np.add.reduceat(matrix[parts.bins], parts.start)
-        return parts, np.asarray(summed / parts.count[:, None, None])
+        mean = matrix[parts.bins]
+        if len(parts.start) < len(mean):
+            summed = np.add.reduceat(mean, parts.start)
+            mean = np.asarray(summed * (1 / parts.count)[:, None, None], np.complex128)
+        return parts, mean
 
     at = np.arange(len(begin))
     parts, mean = cut(at, sizes)
