@@ -47,6 +47,7 @@ from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.estimation.snapshot_builder import DIAGNOSIS_SHARE, SnapshotBuilder, keep_few, why_nothing
 from daq.recording.interface import ReadableRecording, created_at
 from estimator.checks.shared_noise import MAX_CHANNELS
+from estimator.spectra.multiresolution import Band
 from estimator.spectra.welch import WelchSettings
 
 _LOGGER = logging.getLogger(__name__)
@@ -339,13 +340,13 @@ class Estimation:
             nonlocal total
             total += n
 
-        self._take_all(count, repeat)
+        bands = self._take_all(count, repeat)
         doubted = [each for each in self._passes if each.shows_drifts]
         if any([each.doubt_stated_times() for each in doubted]):  # noqa: C419 - of all of them
             repeat(done - self.n_seen)
             self._equalisation.reset()
-            self._take_all(count, repeat)
-        snapshot = self._snapshots.build(self._recordings, self._passes, final=True)
+            bands = self._take_all(count, repeat)
+        snapshot = self._snapshots.build(self._recordings, self._passes, final=True, raw=bands)
         nothing = not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values())
         if nothing and (snapshot.results or snapshot.refused or not snapshot.n_segments):
             why = why_nothing(
@@ -354,10 +355,12 @@ class Estimation:
             raise NoResultError(why, snapshot)
         return snapshot
 
-    def _take_all(self, count: Callable[[int], None], repeat: Callable[[int], None]) -> None:
+    def _take_all(
+        self, count: Callable[[int], None], repeat: Callable[[int], None]
+    ) -> tuple[Band, ...]:
         """Take every segment, by the clocks and the filters that follow from all of them.
 
-        `count` and `repeat` are those of `Pass.finish`.
+        `count` and `repeat` are those of `Pass.finish`. Returns their averages.
         """
         is_exact = all(each.aligned.is_exact for each in self._passes)
         if not (is_exact and self._equalisation.is_settled):
@@ -367,12 +370,15 @@ class Estimation:
         for each in self._passes:
             each.finish(count, repeat)
             keep_few([one.single for one in self._passes])
-        if self._equalisation.leaks(averages(self._passes)):
-            # with the clocks known: clocks that are wrong look like responses that differ
-            self._find_filters(count)
-            for each in self._passes:
-                each.advance(count)
-                keep_few([one.single for one in self._passes])
+        bands = averages(self._passes)
+        if not self._equalisation.leaks(bands):
+            return bands
+        # with the clocks known: clocks that are wrong look like responses that differ
+        self._find_filters(count)
+        for each in self._passes:
+            each.advance(count)
+            keep_few([one.single for one in self._passes])
+        return averages(self._passes)
 
     def _find_filters_first(self, count: Callable[[int], None] | None = None) -> None:
         """Find filters before all segments are taken, if there are enough: most are taken once."""

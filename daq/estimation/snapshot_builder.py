@@ -234,7 +234,12 @@ class SnapshotBuilder:
         self._chosen_at = self._grown_to = self._grows_to = 0
 
     def build(
-        self, recordings: Sequence[ReadableRecording], passes: Sequence[Pass], *, final: bool
+        self,
+        recordings: Sequence[ReadableRecording],
+        passes: Sequence[Pass],
+        *,
+        final: bool,
+        raw: tuple[Band, ...] | None = None,
     ) -> Snapshot:
         """Return the estimate from the segments taken so far.
 
@@ -245,10 +250,12 @@ class SnapshotBuilder:
             One for each recording.
         final : bool
             Whether these are all segments there will be: the diagnosis is then made in any case.
+        raw : tuple of Band, optional
+            Averages of the passes, if they are made already.
         """
         first, last = passes[0], passes[-1]
         dims, channels = first.aligned.dims, first.aligned.channels
-        raw = averages(passes)
+        raw = averages(passes) if raw is None else raw
         bands = tuple(
             in_units(band, channels, self._unit, self._equalisation.response(band.frequencies))
             for band in raw
