@@ -37,7 +37,8 @@ from itertools import combinations
 
 import numpy as np
 
-from estimator.types import BoolArray, ComplexArray, FloatArray
+from estimator.levels.noise_matrices import of_sensors
+from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 NORMAL_95 = 1.959963984540054
 """Standard normal quantile of 97.5 %."""
@@ -312,24 +313,30 @@ def _unpredicted(
     scale = 1 / np.sqrt(np.where(good[:, None], psd, 1.0))
     unit = csm * scale[:, :, None] * scale[:, None, :]
     inverse = _inverse(unit, good)
-    for i in range(len(dims)):
-        own, others = np.flatnonzero(sensor == i), np.flatnonzero(sensor != i)
-        left = n_effective - len(others)
+    for rows, columns in of_sensors(sensor):
+        n_others = len(sensor) - rows.shape[1]
+        left = n_effective - n_others
         some = np.flatnonzero(good & (left > LEAST_AVERAGES))
-        if not len(some) or not len(others):
+        if not len(some) or not n_others:
             continue
         if inverse is not None:  # of the inverse, the part of a sensor is that of what is left
-            within = np.linalg.inv(inverse[some[:, None, None], own[:, None], own])
-            rest = np.einsum("fii->fi", within).real
+            within = np.linalg.inv(inverse[some[:, None, None, None], rows, columns])
+            rest = np.einsum("fsii->fsi", within).real.reshape(len(some), -1)
         else:
-            rows = unit if len(some) == len(unit) else unit[some]
-            within, towards = rows[:, others[:, None], others], rows[:, others[:, None], own]
-            try:
-                predicted = np.linalg.solve(within, towards)
-            except np.linalg.LinAlgError:
-                continue
-            rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
-        gain = (n_effective / left)[some, None]
-        level[np.ix_(some, own)] = np.where(rest > 0, rest * gain, np.nan)
-        averages[np.ix_(some, own)] = left[some, None]
+            rest = np.concatenate([_left(unit[some], own) for own in rows[:, :, 0]], axis=1)
+        at = np.ix_(some, rows.ravel())
+        level[at] = np.where(rest > 0, rest * (n_effective / left)[some, None], np.nan)
+        averages[at] = left[some, None]
     return level * np.where(good[:, None], psd, np.nan), averages
+
+
+def _left(unit: ComplexArray, own: IntArray) -> FloatArray:
+    """Return what others do not predict of some channels of coherencies; NaN if they repeat."""
+    others = np.delete(np.arange(unit.shape[1]), own)
+    towards = unit[:, others[:, None], own]
+    try:
+        predicted = np.linalg.solve(unit[:, others[:, None], others], towards)
+    except np.linalg.LinAlgError:
+        return np.full((len(unit), len(own)), np.nan)
+    rest = 1 - (towards.real * predicted.real + towards.imag * predicted.imag).sum(axis=1)
+    return np.asarray(rest, np.float64)
