@@ -436,8 +436,7 @@ def _shared(
 
 def _least(values: FloatArray) -> FloatArray:
     """Return the smallest finite number of each row, shape (n_freqs,); NaN without one."""
-    least = np.where(np.isnan(values), np.inf, values).min(axis=1)
-    return np.where(np.isnan(values).all(axis=1), np.nan, least)
+    return np.asarray(np.fmin.reduce(values, axis=1), np.float64)
 
 
 def _condition(

@@ -112,7 +112,8 @@ class CanonicalCoherence:
         pair = frozenset((one, two))
         if pair not in self._found:
             found = np.zeros((self._n_freqs, len(one)))
-            found[self.usable] = _squares(*self._whitened(one, two))
+            towards = _part(self._csm, self._rows, one, two)
+            found[self.usable] = _squares(towards, self._root(one), self._root(two))
             self._found[pair] = np.clip(found, 0.0, 1.0)
         return self._found[pair]
 
@@ -121,18 +122,11 @@ class CanonicalCoherence:
         one, two = sorted((tuple(first), tuple(second)), key=len)
         pair = frozenset((one, two))
         if pair not in self._means:
-            found = np.zeros(self._n_freqs)
-            towards, root_one, root_two = self._whitened(one, two)
-            square = np.linalg.norm(root_one @ towards @ root_two, axis=(1, 2)) ** 2
-            found[self.usable] = np.clip(square / len(one), 0.0, 1.0)
-            self._means[pair] = found
+            towards = _part(self._csm, self._rows, one, two)
+            size = np.linalg.norm(self._root(one) @ towards @ self._root(two), axis=(1, 2))
+            self._means[pair] = found = np.zeros(self._n_freqs)
+            found[self.usable] = np.clip(size**2 / len(one), 0.0, 1.0)
         return self._means[pair]
-
-    def _whitened(
-        self, one: tuple[int, ...], two: tuple[int, ...]
-    ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return the cross-spectra of two groups, and what whitens them on either side."""
-        return _part(self._csm, self._rows, one, two), self._root(one), self._root(two)
 
     def _root(self, channels: tuple[int, ...]) -> ComplexArray:
         """Return the inverse root of a group's matrix, cached."""

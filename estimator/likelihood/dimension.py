@@ -452,22 +452,16 @@ class _Search:
         self._expected = 1 / psd  # in units of the coherency matrix
 
     def fit(
-        self,
-        q: int,
-        some: list[int],
-        *,
-        every: int = 1,
-        most: int | None = None,
-        channels: IntArray | None = None,
+        self, q: int, some: list[int], *, every: int = 1, channels: IntArray | None = None
     ) -> _Fit:
         """Maximise the likelihood of q factors in these bands, at every so many frequencies.
 
-        In `most` steps and of some channels alone, where that is stated.
+        Of some channels alone, where these are stated, in few steps.
         """
         rows = np.flatnonzero(np.isin(self._number, some))[every // 2 :: every]
-        if most is not None:
-            at = np.arange(self._matrix.shape[1]) if channels is None else channels
-            maximum = maximise(self._matrix[rows[:, None, None], at[:, None], at], q, most=most)
+        if channels is not None:
+            few = self._matrix[rows[:, None, None], channels[:, None], channels]
+            maximum = maximise(few, q, most=LOOK_STEPS)
         elif q <= self._usual:
             maximum = self._maxima.maximise(self._matrix[rows], q)
         else:
@@ -478,7 +472,7 @@ class _Search:
                 kind=self._kind,
                 n_effective=self._n_effective,
             )
-        if most is None and q <= self._usual + 1:
+        if channels is None and q <= self._usual + 1:
             for b in some:
                 here = self._number[rows] == b
                 self.axes[b] = maximum.eigenvectors[here]
@@ -539,18 +533,15 @@ class _Search:
         """Return the tests of bands that few of their frequencies reject beyond doubt."""
         found: dict[int, goodness_of_fit.BandTest] = {}
         sensor = np.repeat(np.arange(len(self._dims)), self._dims)
-        every = -(-len(sensor) // LOOK_CHANNELS)
-        few = np.flatnonzero(sensor % every == 0)
-        looks: list[tuple[IntArray | None, int | None, float]] = [(None, None, 1.0)]
-        if q < self._usual:
-            looks.insert(0, (None, LOOK_STEPS, BEYOND_DOUBT))
-            if every > 1 and (len(few) - q) ** 2 > EQUATIONS * len(few):
-                looks.insert(0, (few, LOOK_STEPS, BEYOND_DOUBT))
-        for channels, most, beyond in looks:
+        few = np.flatnonzero(sensor % -(-len(sensor) // LOOK_CHANNELS) == 0)
+        if (len(few) - q) ** 2 <= EQUATIONS * len(few):
+            few = np.arange(len(sensor))
+        looks = ((few, BEYOND_DOUBT),) if q < self._usual else ()
+        for channels, beyond in (*looks, (None, 1.0)):
             left = [b for b in some if b not in found]
             if not left:
                 break
-            look = self.fit(q, left, every=FIRST_LOOK, most=most, channels=channels)
+            look = self.fit(q, left, every=FIRST_LOOK, channels=channels)
             for b in left:
                 distant = neighbours[FIRST_LOOK * stride[b] - 1 :: FIRST_LOOK * stride[b]]
                 test = goodness_of_fit.pool(look.test, look.number == b, neighbours=distant)
