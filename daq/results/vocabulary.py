@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.recording.sensor_state import SensorState
 from daq.results.band_summary import WithoutPartner
-from estimator.checks.sensitivities import Cause
 from estimator.levels.contributions import Source
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag
@@ -41,14 +40,6 @@ REASONS: Mapping[Reason, str] = {
     Reason.CHOSEN: "by choice of the time (--exclude)",
 }
 """Why segments were excluded; the text follows their number."""
-
-CAUSES: Mapping[Cause, str] = {
-    Cause.GRAVITY: "g in place of m/s², or the reverse",
-    Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
-    Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
-    Cause.CHANGED: "it changed in the test",
-}
-"""What makes a sensitivity wrong by a factor."""
 
 
 @dataclass(frozen=True, slots=True)

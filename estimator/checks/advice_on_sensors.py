@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, Self, TypeVar
 
 from estimator.checks.advice import Advice, Names, Rank
+from estimator.checks.sensitivities import CAUSES, likely_cause
 from estimator.records import Seconds
 from estimator.wording import Words, degrees, few, listed, percent, ratio, signed
 
@@ -186,12 +187,14 @@ class Gain(Advice):
     def _words(self, names: Names) -> Words:
         what = "sensitivities and axes" if _is_single(self, names) else "sensitivities"
         is_single = _is_single(self, names)
+        cause = likely_cause(self.ratio)
+        why = "" if cause is None else f" ({CAUSES[cause]})"
         return Words(
             f"{names.channels[self.channel]} reads {self.ratio:.3f} of "
-            f"{names.channels[self.counterpart]}: check both {what}",
+            f"{names.channels[self.counterpart]}{why}: check both {what}",
             f"The gain of {names.channels[self.channel]} is {self.ratio:.3f} times that of "
-            f"{names.channels[self.counterpart]}: no bias, but one of the two sensitivities is "
-            "wrong, and with it the noise in physical units"
+            f"{names.channels[self.counterpart]}{why}: no bias, but one of the two sensitivities "
+            "is wrong, and with it the noise in physical units"
             + (", or their axes point in different directions." if is_single else "."),
             "Check the sensitivities in the bench file"
             + (", and the directions of the axes." if is_single else "."),

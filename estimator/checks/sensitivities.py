@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -39,6 +39,15 @@ class Cause(enum.StrEnum):
     """Another position of a gain switch, or another multiple of the unit."""
     CHANGED = "changed"
     """The sensor changed, or was carried away, in the test: no sensitivity is wrong."""
+
+
+CAUSES: Mapping[Cause, str] = {
+    Cause.GRAVITY: "g in place of m/s², or the reverse",
+    Cause.FACTOR_TWO: "a factor of 2, as between single-ended and differential inputs",
+    Cause.GAIN_SWITCH: "another position of a gain switch, or another multiple of the unit",
+    Cause.CHANGED: "it changed in the test",
+}
+"""What makes a sensitivity wrong by a factor."""
 
 
 @dataclass(frozen=True, slots=True)

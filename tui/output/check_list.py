@@ -8,7 +8,7 @@ from typing import Any
 from rich.text import Text
 
 from daq.preflight.findings import Check, CheckFinding, CheckOutcome, CheckRow, Problem
-from daq.results.vocabulary import CAUSES
+from estimator.checks.sensitivities import CAUSES
 from estimator.wording import listed
 
 MARKS: Mapping[CheckOutcome, str] = {

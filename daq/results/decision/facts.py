@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 
 from daq.results.facts.fact import Fact
-from daq.results.vocabulary import CAUSES
-from estimator.checks.sensitivities import Cause
+from estimator.checks.sensitivities import CAUSES, Cause
 from estimator.decision.verdict import MIN_AVERAGES, Obstacle
 from estimator.records import Hertz
 from estimator.wording import Words, few, listed

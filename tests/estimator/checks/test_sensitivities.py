@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from estimator.checks.advice import Names, Rank
+from estimator.checks.advice_on_sensors import Gain
 from estimator.checks.relative_response import relative_response
-from estimator.checks.sensitivities import Cause, WrongGain, likely_cause, wrong_gains
+from estimator.checks.sensitivities import CAUSES, Cause, WrongGain, likely_cause, wrong_gains
 from tests.estimator.csm_models import wishart
 
 FREQUENCY = np.linspace(0.5, 50, 100)
@@ -88,3 +90,7 @@ def test_where_no_majority_agrees_every_sensor_is_doubted() -> None:
 )
 def test_factors_suggest_their_cause(gain: float, cause: Cause | None) -> None:
     assert likely_cause(gain) is cause
+    names = Names(("A", "B"), ("A.X", "B.X"), (1, 1))
+    advice = Gain(rank=Rank.DELAYS, sensors=(0, 1), channel=1, counterpart=0, ratio=gain)
+    shown = [f"({text})" in advice.words(names).line for text in CAUSES.values()]
+    assert sum(shown) == (cause is not None)

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 from daq.estimation.snapshot import Snapshot
 from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
-from daq.results.vocabulary import CAUSES
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.relative_response import relative_response
-from estimator.checks.sensitivities import Cause
+from estimator.checks.sensitivities import CAUSES, Cause
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.methods import self_noise
 from tests.daq.results.decision.benches import bench_with
