@@ -108,7 +108,7 @@ def test_drift_is_found_where_every_segment_has_a_gap(tmp_path: Path) -> None:
     assert snapshot.clocks[2].corrected == pytest.approx(drift, rel=0.1)
 
 
-@pytest.mark.parametrize("first", [8000, 18_000])
+@pytest.mark.parametrize("first", [18_000, pytest.param(8000, marks=LONG)])
 def test_a_beginning_without_motion_does_not_hide_a_drift(tmp_path: Path, first: int) -> None:
     sensors, noise = huddle(1e4, PPM), np.random.default_rng(2)
     for sensor in sensors.values():

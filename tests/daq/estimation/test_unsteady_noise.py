@@ -197,7 +197,7 @@ def test_gusts_are_no_motion_and_bound_no_level() -> None:
         + level * rng.standard_normal((n, 3))
         for name in "ABCDE"
     }
-    estimate = huddle.self_noise(samples, fs=RATE, segment="2s")
+    estimate = huddle.self_noise(samples, fs=RATE, segment="5s")
     snapshot, truth = estimate.snapshot, float((level**2).mean()) * 2 / RATE
     found = Result(snapshot, Settings()).spectrum("maximum-likelihood").levels(EDGES)
     low, high = found.ends()
