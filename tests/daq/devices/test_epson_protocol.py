@@ -201,8 +201,9 @@ def test_a_reset_restarts_the_clock_and_estimates_the_gap() -> None:
     assert block.device_counter == 0
 
 
-def test_clipping_and_errors_are_reported() -> None:
-    values = {"temperature": 0, "x": -15 * 2**24, "y": 0, "z": 0}
+@pytest.mark.parametrize("end", [-15 * 2**24, 15 * 2**24])
+def test_clipping_and_errors_are_reported(end: int) -> None:
+    values = {"temperature": 0, "x": end, "y": 0, "z": 0}
     (block, event) = decoder().receive(
         commands.encode_bursts(ALL, flag=0x8E01, **values, count=0), at(0)
     )
