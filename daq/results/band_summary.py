@@ -27,6 +27,7 @@ from estimator.levels.bands import (
     band_levels,
     bin_correlation,
     third_octaves,
+    widths,
 )
 from estimator.levels.contributions import (
     Contribution,
@@ -241,7 +242,7 @@ class Spectrum:
         self._doubtful = may_share(snapshot)
         self._shares &= ~self._doubtful[0][:, None]  # bounded by its own spectrum
         known = np.isfinite(noise.noise_psd)
-        self._weight = np.where(known, self._width[:, None], 0.0)
+        self._weight = widths(snapshot.frequency, known)
         self._anything = known & np.logical_or.reduce(
             [np.isinf(each.share + each.above) for each in self._contributions] or [~known]
         )
@@ -263,10 +264,8 @@ class Spectrum:
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         width, weight = self._width[here], self._weight[here]
         common = None if self._common is None else self._common[here]
-        levels = partial(
-            band_levels, edges=edges, correlation=correlation, weights=width, common=common
-        )
-        bound = levels(rest, scatter)
+        levels = partial(band_levels, edges=edges, correlation=correlation, common=common)
+        bound = levels(rest, scatter, weights=width)
         psd, cumulants = noise.noise_psd[here], noise.cumulants[:, here]
         parts = [each.at(here) for each in self._contributions]
         below = self._below_bound(edges, here, rest)
@@ -275,7 +274,7 @@ class Spectrum:
             cumulants[:, below] = scatter[:, below]
             inside = np.repeat(np.logical_or.reduceat(below, edges[:-1]), np.diff(edges), axis=0)
             parts = list(up_to(parts, rest, below, psd, inside))
-        found = levels(psd, cumulants)
+        found = levels(psd, cumulants, weights=weight)
         widening = tuple(each.in_bands(edges, weight, psd) for each in parts)
         unknown = (noise.flags[here] & Flag.UNIDENTIFIED) != 0
         return Levels(found, widening, bound, np.logical_or.reduceat(unknown, edges[:-1]))
@@ -443,10 +442,9 @@ class Estimate:
             cov = noise.cov[edges[0] : edges[-1]]
             medians = median_of_columns(np.where(np.isfinite(cov), cov, np.nan))
             return [float(median) for median in medians]
-        width, correlation = np.gradient(snapshot.frequency), correlation_of(settings)
         found = band_levels(
-            *(noise.noise_psd, noise.cumulants, edges, correlation),
-            weights=width,
+            *(noise.noise_psd, noise.cumulants, edges, correlation_of(settings)),
+            weights=widths(snapshot.frequency, np.isfinite(noise.noise_psd)),
             common=snapshot.diagnostics.common_at(snapshot.frequency),
         )
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -97,8 +97,8 @@ def band_levels(
         Band b has bins ``edges[b]`` to ``edges[b + 1]``, excluded; increasing.
     correlation : float64, shape (N_LAGS,)
         From :func:`bin_correlation`.
-    weights : float64, shape (n_freqs,), optional
-        Weights of the bins in the mean, such as their widths.
+    weights : float64, shape (n_freqs,) or (n_freqs, n_channels), optional
+        Weights of the bins in the mean, such as their `widths`.
     common : float64, shape (n_freqs, n_channels), optional
         Variance that all bins have in common, as a share of the square of the noise.
 
@@ -116,7 +116,7 @@ def band_levels(
     psd, scatter = noise_psd[first:last], cumulants[:, first:last]
     known = np.isfinite(psd) & np.isfinite(scatter).all(axis=0)
     share = np.ones(len(psd)) if weights is None else weights[first:last]
-    weight = np.where(known, share[:, None], 0.0)
+    weight = np.where(known, share.reshape(len(psd), -1), 0.0)
     total = np.add.reduceat(weight, starts, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.add.reduceat(np.where(known, psd, 0.0) * weight, starts, axis=0) / total
@@ -136,6 +136,20 @@ def band_levels(
         most = np.maximum.reduceat(common[first:last], starts, axis=0)
         found += np.stack([mean**k * most ** (k - 1) for k in (2, 3, 4)])
     return BandLevels(mean, found, np.logical_and.reduceat(known, starts, axis=0))
+
+
+def widths(frequency: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
+    """Return how wide a stretch each known bin stands for, that of unknown neighbours included.
+
+    In Hz, of shape (n_freqs, n_channels) as `known`; 0 where nothing is known. So a mean over few
+    of the bins of a sloping spectrum is that of its band.
+    """
+    found = np.where(known, np.gradient(frequency)[:, None], 0.0)
+    for column in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
+        there = np.flatnonzero(known[:, column])
+        if len(there) > 1:
+            found[there, column] = np.gradient(frequency[there])
+    return found
 
 
 def band_edges(frequency: FloatArray, band: tuple[float, float]) -> NDArray[np.int64]:

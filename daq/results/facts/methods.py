@@ -18,6 +18,7 @@ from estimator.checks.advice_on_signals import Copies, MissingChannels, NoShared
 from estimator.checks.shared_noise import MAX_CHANNELS
 from estimator.self_noise.result import Flag
 from estimator.spectra.segment_rejection import Reason
+from estimator.types import BoolArray
 from estimator.wording import Words, few, listed
 
 WITHOUT_ESTIMATE = (
@@ -92,6 +93,20 @@ class NoEstimateAbove(Fact):
     def _words(self) -> Words:
         limit = math.nan if self.band is None else self.band[0]
         text = f"no estimate above {limit:.4g} Hz, where resampling attenuates"
+        return Words(text, f"{text[0].upper()}{text[1:]}.")
+
+
+class FewerFrequencies(Fact):
+    """Responses change, and averages within parts of time are kept at `n` of `n_frequencies`."""
+
+    n: int
+    n_frequencies: int
+
+    def _words(self) -> Words:
+        text = (
+            f"averages within parts of time, between which a response changes, are kept at {self.n}"
+            f" of {self.n_frequencies} frequencies: curves have gaps"
+        )
         return Words(text, f"{text[0].upper()}{text[1:]}.")
 
 
@@ -183,6 +198,10 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
         names = tuple(name for name, holds in causes if holds) or (TOO_LITTLE,)
         yield SteadinessNotTested(rank=Rank.TO_KNOW, causes=names)
     yield from facts_of_changes(snapshot)
+    kept = _kept_within_parts(snapshot)
+    if snapshot.results and not kept.all():
+        n = int(kept.sum())
+        yield FewerFrequencies(rank=Rank.TO_KNOW, n=n, n_frequencies=len(kept))
     if "two-channel" in snapshot.results:
         yield LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel")
     named = any(isinstance(each, NoSignal | Copies) for each in advice)  # once for all methods
@@ -213,6 +232,16 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
         yield MethodRefused(rank=rank, method=method, reason=reason)
 
 
+def _kept_within_parts(snapshot: Snapshot) -> BoolArray:
+    """Return where there are averages within parts, (n_freqs,); everywhere without such."""
+    found = snapshot.diagnostics.diagnosis
+    if found is None or found.stability is None or not any(found.stability.steadied):
+        return np.ones(len(snapshot.frequency), np.bool_)
+    kept = np.isfinite(snapshot.csm).all(axis=(1, 2))
+    kept[[0, -1]] = True
+    return np.asarray(kept)
+
+
 def without_estimate(
     snapshot: Snapshot, method: str, *, besides: Flag = _NO_FLAG
 ) -> Iterator[WithoutEstimate]:
@@ -223,6 +252,7 @@ def without_estimate(
     """
     low, high = known_range(snapshot)
     inside = (snapshot.frequency >= low) & (snapshot.frequency < high)
+    inside &= _kept_within_parts(snapshot)
     flags = snapshot.results[method].flags[inside]
     for flag in Flag:
         if not flag & (WITHOUT_ESTIMATE | Flag.NOT_CONVERGED) & ~besides:

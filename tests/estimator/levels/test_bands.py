@@ -9,7 +9,7 @@ import pytest
 
 from daq.results.band_summary import band_of
 from daq.results.result import Result
-from estimator.levels.bands import band_edges, band_levels, bin_correlation, log_edges
+from estimator.levels.bands import band_edges, band_levels, bin_correlation, log_edges, widths
 from estimator.levels.contributions import Source, contribution, up_to, widened
 from estimator.levels.interval import like_psd
 from estimator.median import median_of_columns
@@ -47,6 +47,18 @@ def test_hann_bins_are_correlated_as_in_theory() -> None:
     np.testing.assert_allclose(
         bin_correlation(window, 256)[:4], [1, (2 / 3) ** 2, (1 / 6) ** 2, 0], atol=1e-12
     )
+
+
+def test_few_bins_of_a_sloping_spectrum_are_its_mean() -> None:
+    """A third of the bins, at constant ratios: every known bin counts for unknown neighbours."""
+    frequency = np.arange(1, 501) * 0.1
+    kept = np.unique(np.round(np.geomspace(1, 500, 250)).astype(int)) - 1
+    psd = np.where(np.isin(np.arange(500), kept), frequency**-1.2, np.nan)[:, None]
+    edges, known = np.array([19, 200]), np.isfinite(psd)
+    scatter = like_psd(psd, 0.1 * psd)
+    found = band_levels(psd, scatter, edges, np.ones(1), weights=widths(frequency, known))
+    assert found.mean[0, 0] == pytest.approx((frequency[19:200] ** -1.2).mean(), rel=0.02)
+    np.testing.assert_allclose(widths(frequency, ~np.isnan(frequency)[:, None]), 0.1)
 
 
 def test_bins_with_nan_are_ignored_and_negative_means_remain_negative() -> None:

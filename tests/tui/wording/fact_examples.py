@@ -47,6 +47,7 @@ from daq.results.facts.clocks import (
 from daq.results.facts.fact import Fact, Finding
 from daq.results.facts.methods import (
     DirectionsPooled,
+    FewerFrequencies,
     LikeChannelsAssumed,
     MethodRefused,
     NoEstimateAbove,
@@ -243,6 +244,7 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=120, most=96),
     SteadinessNotTested(rank=Rank.TO_KNOW, causes=("archives",)),
+    FewerFrequencies(rank=Rank.TO_KNOW, n=303, n_frequencies=499),
     LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel"),
     DirectionsPooled(
         rank=Rank.TO_KNOW, method="three-sensor", band=(10.0, 20.0), n=21, n_frequencies=199
