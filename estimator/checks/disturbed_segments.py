@@ -40,7 +40,7 @@ TOGETHER = 4
 """Segments whose products are averaged before their scatter is measured: neighbours overlap."""
 UNSTABLE = 4.5
 """Standard errors from which gains change from segment to segment."""
-FLUCTUATES = 2.0
+FLUCTUATES = 3.0
 """The same for the loudness of noise: it widens intervals, and nothing is said of it."""
 LARGEST = 0.5
 """Variance of a gain over the largest of all, from which it is no part of that in the motion."""

@@ -237,9 +237,9 @@ def _kept_within_parts(snapshot: Snapshot) -> BoolArray:
     found = snapshot.diagnostics.diagnosis
     if found is None or found.stability is None or not any(found.stability.steadied):
         return np.ones(len(snapshot.frequency), np.bool_)
-    kept = np.isfinite(snapshot.csm).all(axis=(1, 2))
+    kept = np.asarray(np.isfinite(snapshot.csm).all(axis=(1, 2)))
     kept[[0, -1]] = True
-    return np.asarray(kept)
+    return kept
 
 
 def without_estimate(
