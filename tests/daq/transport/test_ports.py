@@ -26,6 +26,7 @@ from daq.host_clock import SystemClock
 from daq.protocols.block import Block
 from daq.transport import address
 from daq.transport.address import host_and_port
+from daq.transport.byte_stream import ByteStream
 from daq.transport.ports import open_port
 from tests.waiting import limit
 
@@ -136,6 +137,15 @@ async def test_a_hang_up_ends_the_stream_after_its_last_bytes(kind: str) -> None
                 await stream.read()
             with pytest.raises(NotConnectedError):
                 await stream.write(b"?")
+
+
+async def test_what_came_before_the_port_closed_is_read_first() -> None:
+    stream = ByteStream("sensor A", SystemClock())
+    stream.feed(b"last")
+    stream.lost("unplugged")
+    assert (await stream.read())[0] == b"last"
+    with pytest.raises(NotConnectedError, match="unplugged"):
+        await stream.read()
 
 
 @pytest.mark.parametrize("port", ["spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class=os"])
