@@ -242,7 +242,7 @@ class Spectrum:
         self._doubtful = may_share(snapshot)
         self._shares &= ~self._doubtful[0][:, None]  # bounded by its own spectrum
         known = np.isfinite(noise.noise_psd)
-        self._weight = widths(snapshot.frequency, known)
+        self._known = known
         self._anything = known & np.logical_or.reduce(
             [np.isinf(each.share + each.above) for each in self._contributions] or [~known]
         )
@@ -262,7 +262,8 @@ class Spectrum:
         here, edges = slice(begin, end), edges - begin
         rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
-        width, weight = self._width[here], self._weight[here]
+        width = self._width[here]
+        weight = widths(self._snapshot.frequency[here], self._known[here], edges)
         common = None if self._common is None else self._common[here]
         levels = partial(band_levels, edges=edges, correlation=correlation, common=common)
         bound = levels(rest, scatter, weights=width)
@@ -285,7 +286,7 @@ class Spectrum:
         These bins cost a band their own share: their noise is between zero and the bound.
         """
         anything, sizes = self._anything[here], np.diff(edges)
-        known = np.logical_or.reduceat((self._weight[here] > 0) & ~anything, edges[:-1])
+        known = np.logical_or.reduceat(self._known[here] & ~anything, edges[:-1])
         return np.asarray(anything & (bound > 0) & np.repeat(known, sizes, axis=0))
 
     def _unpredicted(self, begin: int, end: int) -> tuple[int, FloatArray, FloatArray]:
@@ -444,7 +445,7 @@ class Estimate:
             return [float(median) for median in medians]
         found = band_levels(
             *(noise.noise_psd, noise.cumulants, edges, correlation_of(settings)),
-            weights=widths(snapshot.frequency, np.isfinite(noise.noise_psd)),
+            weights=widths(snapshot.frequency, np.isfinite(noise.noise_psd), edges),
             common=snapshot.diagnostics.common_at(snapshot.frequency),
         )
         with np.errstate(invalid="ignore", divide="ignore"):

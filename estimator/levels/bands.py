@@ -12,6 +12,8 @@ the same correlation.
 
 from __future__ import annotations
 
+from itertools import pairwise, product
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -138,17 +140,21 @@ def band_levels(
     return BandLevels(mean, found, np.logical_and.reduceat(known, starts, axis=0))
 
 
-def widths(frequency: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
-    """Return how wide a stretch each known bin stands for, that of unknown neighbours included.
+def widths(frequency: FloatArray, known: NDArray[np.bool_], edges: NDArray[np.int64]) -> FloatArray:
+    """Return how much of its band each known bin stands for, with its unknown neighbours.
 
     In Hz, of shape (n_freqs, n_channels) as `known`; 0 where nothing is known. So a mean over few
-    of the bins of a sloping spectrum is that of its band.
+    of the bins of a sloping spectrum is that of its band. `edges` are those of `band_levels`.
     """
+    middle = (frequency[1:] + frequency[:-1]) / 2
+    ends = np.concatenate([frequency[:1], middle, frequency[-1:]])
     found = np.where(known, np.gradient(frequency)[:, None], 0.0)
-    for column in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
-        there = np.flatnonzero(known[:, column])
-        if len(there) > 1:
-            found[there, column] = np.gradient(frequency[there])
+    some = np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist()
+    for column, (low, high) in product(some, pairwise(edges.tolist())):
+        there = low + np.flatnonzero(known[low:high, column])
+        if 0 < len(there) < high - low:
+            between = (frequency[there[1:]] + frequency[there[:-1]]) / 2
+            found[there, column] = np.diff(np.concatenate([[ends[low]], between, [ends[high]]]))
     return found
 
 

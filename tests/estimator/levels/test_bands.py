@@ -54,11 +54,22 @@ def test_few_bins_of_a_sloping_spectrum_are_its_mean() -> None:
     frequency = np.arange(0.1, 50.05, 0.1)
     kept = np.unique(np.round(np.geomspace(1, 500, 250)).astype(int)) - 1
     psd = np.where(np.isin(np.arange(500), kept), frequency**-1.2, np.nan)[:, None]
-    edges, known = np.array([19, 200]), np.isfinite(psd)
+    edges, known = np.array([19, 60, 200]), np.isfinite(psd)
     scatter = like_psd(psd, 0.1 * psd)
-    found = band_levels(psd, scatter, edges, np.ones(1), weights=widths(frequency, known))
-    assert found.mean[0, 0] == pytest.approx((frequency[19:200] ** -1.2).mean(), rel=0.02)
-    np.testing.assert_allclose(widths(frequency, ~np.isnan(frequency)[:, None]), 0.1)
+    weights = widths(frequency, known, edges)
+    found = band_levels(psd, scatter, edges, np.ones(1), weights=weights)
+    whole = [(frequency[low:high] ** -1.2).mean() for low, high in ((19, 60), (60, 200))]
+    np.testing.assert_allclose(found.mean[:, 0], whole, rtol=0.02)
+    assert not weights[~known].any()
+
+
+def test_what_is_known_beyond_a_band_leaves_it_as_it_is() -> None:
+    frequency = np.arange(0.0, 10.1, 0.1)
+    known = ((frequency < 3) | (frequency > 8))[:, None]
+    weights = widths(frequency, known, np.array([10, 41, 101]))
+    np.testing.assert_allclose(weights[10:29, 0], 0.1)
+    assert weights[29, 0] == pytest.approx(0.1 + 1.1)  # up to the end of its band
+    assert weights[10:41, 0].sum() == pytest.approx(3.1)
 
 
 def test_bins_with_nan_are_ignored_and_negative_means_remain_negative() -> None:
