@@ -188,7 +188,7 @@ def drive(session: Session) -> None:
         "The next test, without an end. Somebody carries sensor C away: the alert names it.",
     )
     session.press("x", "y")
-    session.see("recording  ", "channel    data", "w Report")
+    session.see("channel    data", "w Report")
     session.ask("Which tests are there?", "4", answer="▸ 20")
     session.ask(
         "How does this compare with the test before?", "\x1b[B", "c", answer="compared with"
