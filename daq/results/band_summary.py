@@ -259,11 +259,11 @@ class Spectrum:
         noise, correlation = self._noise, self._correlation
         first, rest, scatter = self._unpredicted(int(edges[0]), int(edges[-1]))
         begin, end = int(edges[0]), int(edges[-1])
+        weight = widths(self._snapshot.frequency, self._known, edges)[begin:end]
         here, edges = slice(begin, end), edges - begin
         rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         width = self._width[here]
-        weight = widths(self._snapshot.frequency[here], self._known[here], edges)
         common = None if self._common is None else self._common[here]
         levels = partial(band_levels, edges=edges, correlation=correlation, common=common)
         bound = levels(rest, scatter, weights=width)

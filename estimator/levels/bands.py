@@ -141,7 +141,7 @@ def band_levels(
 
 
 def widths(frequency: FloatArray, known: NDArray[np.bool_], edges: NDArray[np.int64]) -> FloatArray:
-    """Return how much of its band each known bin stands for, with its unknown neighbours.
+    """Return how much of its band each known bin stands for, with unknown ones between known ones.
 
     In Hz, of shape (n_freqs, n_channels) as `known`; 0 where nothing is known. So a mean over few
     of the bins of a sloping spectrum is that of its band. `edges` are those of `band_levels`.
@@ -154,7 +154,8 @@ def widths(frequency: FloatArray, known: NDArray[np.bool_], edges: NDArray[np.in
         there = low + np.flatnonzero(known[low:high, column])
         if 0 < len(there) < high - low:
             between = (frequency[there[1:]] + frequency[there[:-1]]) / 2
-            found[there, column] = np.diff(np.concatenate([[ends[low]], between, [ends[high]]]))
+            outer = ends[[there[0], there[-1] + 1]]
+            found[there, column] = np.diff(np.concatenate([outer[:1], between, outer[1:]]))
     return found
 
 

@@ -67,9 +67,8 @@ def test_what_is_known_beyond_a_band_leaves_it_as_it_is() -> None:
     frequency = np.arange(0.0, 10.1, 0.1)
     known = ((frequency < 3) | (frequency > 8))[:, None]
     weights = widths(frequency, known, np.array([10, 41, 101]))
-    np.testing.assert_allclose(weights[10:29, 0], 0.1)
-    assert weights[29, 0] == pytest.approx(0.1 + 1.1)  # up to the end of its band
-    assert weights[10:41, 0].sum() == pytest.approx(3.1)
+    np.testing.assert_allclose(weights[10:30, 0], 0.1)
+    np.testing.assert_allclose(weights[81:100, 0], 0.1)
 
 
 def test_bins_with_nan_are_ignored_and_negative_means_remain_negative() -> None:
