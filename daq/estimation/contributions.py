@@ -239,11 +239,15 @@ def with_sensitivities(snapshot: Snapshot, sensitivities: Sensitivities) -> Snap
 def with_contributions(snapshot: Snapshot) -> Snapshot:
     """Return a snapshot whose intervals include what its methods do not know.
 
-    Of noise that changes, estimates scatter more than their cumulants say.
+    Of noise that changes, estimates scatter more than their cumulants say: by that of its loudness,
+    too, which adds as much of the variance of independent segments to every frequency.
     """
-    inflation = snapshot.diagnostics.inflation_at(snapshot.frequency)
+    inflation = snapshot.diagnostics.inflation_at(snapshot.frequency)[:, None]
+    common = snapshot.diagnostics.common_at(snapshot.frequency)
+    if common is not None:
+        inflation = inflation * (1 + snapshot.n_effective * common)
     if (inflation > 1).any():
-        scale = np.stack([inflation, inflation**2, inflation**3])[:, :, None]
+        scale = np.stack([inflation, inflation**2, inflation**3])
         results = {
             name: SelfNoise.of(name, each.noise_psd, scale * each.cumulants, each.flags)
             for name, each in snapshot.results.items()
