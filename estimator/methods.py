@@ -10,6 +10,7 @@ import numpy as np
 
 from estimator.errors import EstimatorError, UnknownMethodError
 from estimator.levels.interval import unpredicted
+from estimator.levels.lags import phases
 from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import EQUATIONS, most_pooled, pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
@@ -258,6 +259,9 @@ def _with_neighbours(
     if len(rows) < len(found.flags) or not np.array_equal(columns, np.arange(len(sensor))):
         matrix = matrix[rows[:, None, None], columns[:, None], columns]
     del given  # as large as all averages
+    turn = phases(matrix, rows, live, n_effective)
+    if turn is not None:
+        matrix = matrix * turn[:, :, None] * turn[:, None, :].conj()
     rest, _ = unpredicted(
         matrix,
         dims=live,

@@ -1,7 +1,8 @@
 """The noise of every channel where single bins do not resolve the motion.
 
 Each bin alone would estimate all directions of its motion, although they hardly change between
-neighbouring bins, and its scatter would contain the cost. Project, then pool:
+neighbouring bins once sensors are in step (`estimator.levels.lags`), and its scatter would contain
+the cost. Project, then pool:
 
 1. A *block* of bins (a third of an octave, `LEAST_BINS` at least) is cut into *sub-blocks* of k
    neighbours that are worth `ENOUGH` averages.
