@@ -51,7 +51,7 @@ class Imported:
 
     ``resampled`` channels were sampled at other instants than the first channel. ``absent`` are
     channels that have no samples where others of the sensor have some, with the number of these
-    rows and of the stretches that they make.
+    rows and of the stretches that they make. ``undated`` is the file, if it has no date.
     """
 
     sensor: str
@@ -63,6 +63,7 @@ class Imported:
     missing: int
     resampled: tuple[str, ...] = ()
     absent: tuple[tuple[str, int, int], ...] = ()
+    undated: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -607,6 +608,7 @@ def _imported(sensor: ForeignSensor) -> Imported:
         missing=sum(first - end for first, end in zip(first_samples[1:], ends[:-1], strict=True)),
         resampled=tuple(channel for channel in sensor.channels if channel in resampled),
         absent=_absent(sensor),
+        undated="" if sensor.dated_spans_ns() else sensor.source,
     )
 
 

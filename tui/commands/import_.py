@@ -295,7 +295,7 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
     rows = (
         (
             *(entry.sensor, " ".join(entry.channels), f"{entry.sampling_rate:g} Hz"),
-            *(utc(entry.start_utc_ns), entry.n_samples),
+            *("no date" if entry.undated else utc(entry.start_utc_ns), entry.n_samples),
             f"{entry.n_gaps} ({several(entry.missing, 'sample')})" if entry.n_gaps else "none",
         )
         for entry in result.sensors
@@ -325,12 +325,19 @@ def _show(result: ImportResult, out: Path, json: str | None) -> None:
 
 
 def show_taken(result: ImportResult, screen: Console) -> None:
-    """Print the calibration of every channel, and what was left aside or not imported."""
+    """Print the calibration of every channel, and what was assumed, left aside or not imported."""
     for line in _calibrations(result):
         screen.print(line, soft_wrap=True)
     for reason in sorted(set(result.left_aside.values())):
         names = [name for name, why in result.left_aside.items() if why == reason]
         screen.print(f"left aside ({reason}): {' '.join(sorted(names))}")
+    undated = {each.undated: each.sensor for each in result.sensors if each.undated}
+    if len(undated) > 1:
+        notices().print(
+            f"no date in the files of {', '.join(undated.values())}: taken to begin at the same"
+            " instant; otherwise give each a column of times with dates",
+            soft_wrap=True,
+        )
     for problem in result.problems:
         notices().print(f"not imported: {problem}", soft_wrap=True)
 

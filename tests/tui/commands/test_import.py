@@ -95,6 +95,20 @@ def test_the_rate_of_files_without_times_and_that_of_a_sensor_are_one_option(
         assert recording.bench.estimate.sampling_rates == {"B": 99.5}
 
 
+def test_files_without_a_date_are_said_to_begin_together(tmp_path: Path) -> None:
+    rows = "X\n" + "1\n3\n" * 500
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text(rows, encoding="utf-8")
+    (tmp_path / "both.csv").write_text("A.X,B.X\n" + "1,2\n3,5\n" * 500, encoding="utf-8")
+    given = ("--sampling-rate", "100")
+    two = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    found = huddle("import", *two, *given, "-o", tmp_path / "two.h5")
+    assert "no date in the files of a, b: taken to begin at the same instant" in found.stderr
+    assert "1970" not in found.stdout
+    found = huddle("import", tmp_path / "both.csv", *given, "-o", tmp_path / "one.h5")
+    assert "no date in" not in found.stderr
+
+
 def test_what_single_channels_lack_is_printed(tmp_path: Path) -> None:
     write_records(tmp_path / "a", counts(600, 1), channel="HHZ")
     write_records(tmp_path / "b", counts(200, 2), channel="HHN", start=START + 100 * STEP)
