@@ -108,14 +108,21 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     found += _contradicted(snapshot, method, tuple(found))
-    faulty = sorted(diagnostics.faulty)
-    if faulty:
-        below = np.zeros(shape)
-        below[:, faulty] = math.inf
-        found.append(contribution(Source.FAULTY, shape, below=below))
+    if diagnostics.faulty:
+        found.append(_faulty(snapshot, psd))
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
+
+
+def _faulty(snapshot: Snapshot, psd: FloatArray) -> Contribution:
+    """Return what faulty channels may be wrong by."""
+    below, above = np.zeros((2, *psd.shape))
+    below[:, sorted(snapshot.diagnostics.faulty)] = math.inf
+    for column, seconds in snapshot.diagnostics.stood_still.items():
+        lost = min(2 * seconds / snapshot.elapsed, 0.5)  # it reaches into the parts beside
+        above[:, column] = psd[:, column] * lost / (1 - lost)
+    return contribution(Source.FAULTY, psd.shape, below=below, above=above)
 
 
 def _by_motion_that_changes(snapshot: Snapshot, method: str, psd: FloatArray) -> list[Contribution]:

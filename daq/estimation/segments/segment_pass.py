@@ -458,7 +458,7 @@ class Pass:
                 forked.shared(self._all.products_shape, np.float64),
                 forked.shared((n_segments, n_bins, self.n_channels), np.complex64),
                 forked.shared((n_picked, n_freqs, self.n_channels), np.complex128),
-                forked.shared((self.n_channels + 1,), np.int64),
+                forked.shared(self.stillness.counts.shape, np.int64),
             )
 
         def work(piece: _Span, room: _Sums) -> bool:

@@ -15,6 +15,7 @@ from daq.errors import CannotAlignError
 from daq.estimation.contributions import contributions
 from daq.estimation.diagnosis import vertical_channel
 from daq.estimation.estimation import Estimation, estimate
+from daq.estimation.segments.flatline import FlatlineDetector
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.protocols.block import BlockFlag
@@ -145,9 +146,12 @@ def test_what_was_followed_ends_as_the_estimate_from_the_file(
     np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9)
 
 
-def test_a_channel_that_stands_still_for_a_while_counts_as_faulty(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slope", [0.0, 3.7])
+def test_a_channel_that_is_not_measured_for_a_while_counts_as_faulty(
+    slope: float, tmp_path: Path
+) -> None:
     sensors = bench()
-    sensors["b"].counts[4000:7000, 1] = 17
+    sensors["b"].counts[4000:7000, 1] = np.rint(17 + slope * np.arange(3000))
     settings = replace(SETTINGS, reject=False)
     found = estimate([write(tmp_path / "r.h5", sensors)], settings)
     assert found.diagnostics.stood_still == {4: pytest.approx(30, abs=1)}
@@ -159,6 +163,29 @@ def test_a_channel_that_stands_still_for_a_while_counts_as_faulty(tmp_path: Path
     assert np.flatnonzero(np.isinf(faulty.below).all(axis=0)).tolist() == [4]
     gains = [each for each in found.diagnostics.advice if isinstance(each, Gain)]
     assert not gains  # it stood still: its sensitivity is not wrong
+
+
+def test_gaps_of_all_sensors_that_are_interpolated_are_in_the_interval(tmp_path: Path) -> None:
+    sensors = bench()
+    for sensor in sensors.values():
+        for begin in range(500, N_SAMPLES, 3000):  # 10 % of the time, in steps that round
+            ends = sensor.counts[[begin, begin + 300]]
+            lines = ends[0] + np.linspace(0, 1, 301)[:, None] * (ends[1] - ends[0])
+            sensor.counts[begin : begin + 301] = np.rint(lines)
+    found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
+    assert sorted(found.diagnostics.stood_still) == list(range(9))
+    assert min(found.diagnostics.stood_still.values()) > 8
+    (mean,) = Result(found, SETTINGS).means(next(iter(found.results)), (2.0, 40.0))[:1]
+    noise = 2 / RATE * 100**2
+    assert float(mean.mean[0]) < 0.95 * noise < noise < float(mean.high[0])
+
+
+def test_slow_motion_in_coarse_counts_is_not_interpolated() -> None:
+    time = np.arange(60_000) / RATE
+    swell = np.rint(1000 * np.sin(2 * np.pi * 0.1 * time))[:, None]
+    detector = FlatlineDetector(500, 1, RATE)
+    detector.add(swell, np.ones(len(swell), np.bool_))
+    assert detector.for_a_while()[0] == 0
 
 
 def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -> None:
