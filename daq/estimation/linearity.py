@@ -9,19 +9,26 @@ import numpy as np
 from daq.estimation.noise_estimates import Channels, responses
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.snapshot import NonlinearChannel
-from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
+from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes, follows
 from estimator.self_noise.result import Flag, SelfNoise
+from estimator.spectra.multiresolution import Band
 from estimator.types import FloatArray
 
 
 def nonlinear_channels(
-    passes: Sequence[Pass], frequency: FloatArray, channels: Channels, unit: str
+    passes: Sequence[Pass],
+    raw: Sequence[Band],
+    frequency: FloatArray,
+    channels: Channels,
+    unit: str,
 ) -> tuple[NonlinearChannel, ...]:
     """Return the channels that are not linear, the one with the largest evidence first.
 
     Parameters
     ----------
     passes : sequence of Pass
+    raw : sequence of Band
+        Their averages. Where these show no motion, no channel is loud enough to be tested.
     frequency : float64, shape (n_freqs,)
         Of the estimate, in Hz.
     channels : sequence of (str, Channel)
@@ -30,6 +37,10 @@ def nonlinear_channels(
     welch = passes[0].welch
     tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
     if not len(tested.bins) or len(passes[0].aligned.dims) < 2:
+        return ()
+    if [len(each.frequencies) for each in raw] == [len(welch.frequencies)] and not follows(
+        raw[0].csm[tested.bins]
+    ):
         return ()
     total = sum(each.n_seen for each in passes)
     for each in passes:

@@ -291,7 +291,9 @@ class SnapshotBuilder:
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
         counting = _counting_rates(latest) if final else {}
-        nonlinear = nonlinear_channels(passes, frequency, channels, self._unit) if final else ()
+        nonlinear = (
+            nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ()
+        )
         if final:
             give_back()
         psd = np.diagonal(csm, axis1=1, axis2=2).real
