@@ -166,7 +166,7 @@ CHANGING = (
     (r"\b[0-9a-f]{64}\b", "SHA-256"),
     (r"\b[0-9a-f]{32}\b", "RUN"),
     (r"PIER-\d{4}", "PIER-YEAR"),
-    (r"(issued |issue: )\d{4}-\d\d-\d\d", r"\1TODAY"),
+    (r"(issued |issue: |issue \| )\d{4}-\d\d-\d\d", r"\1TODAY"),
     (r"\d\.\d MB", "SIZE"),
     (re.escape(version("huddle-bench")), "VERSION"),
 )
