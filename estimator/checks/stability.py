@@ -239,11 +239,16 @@ class Stability:
         """Return the share of the noise that changes of responses may be, (n_freqs, n_channels).
 
         Negative where noise may be too low. Also returns where it is that within parts: there the
-        averages are those of `steadied`.
+        averages are those of `steadied`. Octaves of too few averages for parts change as others.
         """
         within = np.isfinite(self.within) & any(self.steadied)
         share = np.where(within, self.within, self.explained)
-        return self._at(frequency, share), self._at(frequency, within.astype(np.float64)) > 0
+        tested = self._at(frequency, np.ones_like(share)) > 0
+        most = np.take_along_axis(
+            self.explained, np.abs(self.explained).argmax(axis=0, keepdims=True), axis=0
+        )
+        found = np.where(tested, self._at(frequency, share), most)
+        return found, self._at(frequency, within.astype(np.float64)) > 0
 
     def _at(self, frequency: FloatArray, values: FloatArray) -> FloatArray:
         """Return values of bands at frequencies; 0 outside of the bands."""
@@ -277,6 +282,19 @@ class Stability:
                 for each in self.changes
             ),
         )
+
+
+def _in_all_bands(
+    explained: FloatArray, changes: Sequence[ResponseChange], dims: tuple[int, ...]
+) -> FloatArray:
+    """Return what changes explain; a change of all frequencies is in bands that do not show it."""
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    moved = np.isin(sensor, [each.sensor for each in changes if each.band is None])
+    return np.where(moved & (explained == 0), explained.max(axis=0), explained)
+
+
+FEW_PARTS = 4
+"""Parts of a short recording, in which each has fewer averages than channels."""
 
 
 def stability(
@@ -325,7 +343,8 @@ def stability(
     every, places = (places[each[parts.bins[places]]] for each in (known, good))
     averages = parts.averages
     q = maximum.n_factors
-    groups = grouped(averages, q + max(MIN_DEGREES, maximum.psi.shape[1]))
+    most = float(averages.sum()) / FEW_PARTS
+    groups = grouped(averages, q + max(MIN_DEGREES, min(maximum.psi.shape[1], most - q)))
     if len(groups) < MIN_PARTS:
         return None
     runs = np.array([each.run for each in parts.each])
@@ -373,9 +392,11 @@ def stability(
             dims=dims,
             time=(begin, end),
         )
-    single = SegmentFindings.none(0, dims)
-    if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS:
-        single = segment_findings(course, maximum, good, dims)
+    single = (
+        segment_findings(course, maximum, good, dims)
+        if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS
+        else SegmentFindings.none(0, dims)
+    )
     changes, added, left = _and_unstable(
         (changes, added),
         single,
@@ -385,9 +406,15 @@ def stability(
         dims=dims,
         time=(begin, end),
     )
-    without = None
-    if changes or suspect:
-        without = steadied(parts, maximum, psd, good=good, insides=insides)
+    explained = np.maximum(explained, left)
+    is_short = most < q + n_channels  # parts say that responses change, and nothing within them
+    without = (
+        steadied(parts, maximum, psd, good=good, insides=insides)
+        if (changes or suspect) and not is_short
+        else None
+    )
+    if is_short:
+        explained = _in_all_bands(explained, changes, dims)
     if without is not None:
         kept = np.array([not np.isin(some, without.left_out).any() for some in groups])
         if kept.sum() >= MIN_PARTS:
@@ -409,7 +436,7 @@ def stability(
         inflations=np.array([1.0 if band is None else band.inflation for band in bands]),
         changes=changes,
         added=added,
-        explained=np.maximum(explained, left),
+        explained=explained,
         within=within,
         n_segments=parts.n_segments,
         disturbed=np.flatnonzero(single.disturbed),
