@@ -25,7 +25,7 @@ from daq.results.band_summary import Levels, Spectrum, band_within, correlation_
 from estimator.errors import BandError
 from estimator.levels.bands import BandLevels, band_edges
 from estimator.levels.contributions import Contribution, Source
-from estimator.levels.interval import like_psd
+from estimator.levels.interval import NORMAL_95, like_psd
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -336,6 +336,8 @@ class _Making:
             row[BELOW] = sum((each.below for each in found.contributions), np.zeros(shape))
             row[ABOVE] = sum((each.above for each in found.contributions), np.zeros(shape))
             row[SHARE] = sum((each.share for each in found.contributions), np.zeros(shape))
+            if (loudness := snapshot.diagnostics.loudness) is not None:
+                row[SHARE] += NORMAL_95 * loudness.deviation
             row[BOUND] = np.where(found.bound.complete, found.bound.mean, np.nan)
             row[BOUND_DEVIATION] = np.where(found.bound.complete, found.bound.spread, np.nan)
         self._days.append((self._begin, self._day.n_segments, row))

@@ -90,7 +90,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         with np.errstate(invalid="ignore"):
             most = np.fmin(share * motion, unseen * psd)
         found.append(contribution(Source.AXES, shape, below=most, above=most))
-    found += [*_counts(snapshot, shape), *_nonlinear(snapshot, psd)]
+    found += [*_counts(snapshot, shape), *_nonlinear(snapshot, psd), *_gusts(snapshot, shape)]
     if snapshot.rounding:
         most = snapshot.rounding * np.nan_to_num(snapshot.data_psd)
         found.append(contribution(Source.ROUNDING, shape, below=most, above=most))
@@ -176,6 +176,12 @@ def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution
         yield contribution(Source.COUNTS, shape, below=below, above=above)
 
 
+def _gusts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
+    """Yield how much the mean noise scatters with its loudness."""
+    if (loudness := snapshot.diagnostics.loudness) is not None:
+        yield contribution(Source.GUSTS, shape, deviation=loudness.deviation)
+
+
 def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     """Return what responses that change leave of the motion in the noise."""
     found = snapshot.diagnostics.diagnosis
@@ -246,13 +252,11 @@ def with_sensitivities(snapshot: Snapshot, sensitivities: Sensitivities) -> Snap
 def with_contributions(snapshot: Snapshot) -> Snapshot:
     """Return a snapshot whose intervals include what its methods do not know.
 
-    Of noise that changes, estimates scatter more than their cumulants say: by that of its loudness,
-    too, which adds as much of the variance of independent segments to every frequency.
+    Of noise that changes, estimates scatter more than their cumulants say.
     """
     inflation = snapshot.diagnostics.inflation_at(snapshot.frequency)[:, None]
-    common = snapshot.diagnostics.common_at(snapshot.frequency)
-    if common is not None:
-        inflation = inflation * (1 + snapshot.n_effective * common)
+    if (loudness := snapshot.diagnostics.loudness) is not None:
+        inflation = inflation * (1 + loudness.size**2)
     if (inflation > 1).any():
         scale = np.stack([inflation, inflation**2, inflation**3])
         results = {

@@ -10,6 +10,7 @@ import numpy as np
 
 from estimator.checks.advice import Untested
 from estimator.checks.count_limits import CountLimits
+from estimator.checks.loudness import Loudness
 from estimator.records import dataclass
 
 if TYPE_CHECKING:
@@ -225,9 +226,11 @@ class SnapshotDiagnostics:
         steady = self._stability
         return np.ones(len(frequency)) if steady is None else steady.inflation_at(frequency)
 
-    def common_at(self, frequency: FloatArray) -> FloatArray | None:
-        """Return `Stability.common` at frequencies; None where it is not known."""
-        return None if self._stability is None else self._stability.common_at(frequency)
+    @property
+    def loudness(self) -> Loudness | None:
+        """Changes of the loudness of the noise; None where it is not known, or none changes."""
+        found = None if self._stability is None else self._stability.loudness
+        return found if found is not None and found.size.any() else None
 
     @property
     def _stability(self) -> Stability | None:

@@ -160,7 +160,7 @@ class Levels:
     def deviation(self) -> FloatArray:
         """Standard deviation of the logarithm of all levels of a channel, shape (n_channels,).
 
-        By its sensitivity, which is common to all bands.
+        By its sensitivity, and by the loudness of its noise.
         """
         return np.broadcast_to(deviation(self.contributions), self.mean.shape[1:])
 
@@ -230,7 +230,6 @@ class Spectrum:
         self._noise, self._snapshot = noise, snapshot
         self._width = np.gradient(snapshot.frequency)
         self._correlation = correlation_of(settings)
-        self._common = snapshot.diagnostics.common_at(snapshot.frequency)
         self._contributions = contributions(snapshot, noise.method)
         self._shares = by_two(snapshot) | (shared_parts(snapshot) > 0)
         beside, names = snapshot.diagnostics.beside, snapshot.sensor_names
@@ -264,8 +263,7 @@ class Spectrum:
         rest, scatter = rest[begin - first : end - first], scatter[:, begin - first : end - first]
         rest = np.where(self._shares[here], np.nan, rest)  # others predict noise that they share
         width = self._width[here]
-        common = None if self._common is None else self._common[here]
-        levels = partial(band_levels, edges=edges, correlation=correlation, common=common)
+        levels = partial(band_levels, edges=edges, correlation=correlation)
         bound = levels(rest, scatter, weights=width)
         psd, cumulants = noise.noise_psd[here], noise.cumulants[:, here]
         parts = [each.at(here) for each in self._contributions]
@@ -446,10 +444,11 @@ class Estimate:
         found = band_levels(
             *(noise.noise_psd, noise.cumulants, edges, correlation_of(settings)),
             weights=widths(snapshot.frequency, np.isfinite(noise.noise_psd), edges),
-            common=snapshot.diagnostics.common_at(snapshot.frequency),
         )
         with np.errstate(invalid="ignore", divide="ignore"):
             cov = np.where(np.isfinite(found.mean), found.spread / np.abs(found.mean), -np.inf)
+        if (loudness := snapshot.diagnostics.loudness) is not None:
+            cov = np.hypot(cov, loudness.deviation) * np.sign(cov)
         bounds = (noise.flags[edges[0] : edges[-1]] & Flag.UNIDENTIFIED) != 0
         worst = np.where(bounds.any(axis=0), -np.inf, cov.max(axis=0))  # no precision of a bound
         return [math.nan if each < 0 else each for each in worst.tolist()]

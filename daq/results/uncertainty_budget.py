@@ -27,6 +27,7 @@ from daq.bench.sensitivity import KnownSensitivity
 from daq.estimation.snapshot import ChannelLabel
 from daq.results.band_summary import Estimate, Levels
 from estimator.levels.bands import band_edges, third_octaves
+from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
 from estimator.records import NOT_IN_JSON, dataclass
 from estimator.types import FloatArray
@@ -234,7 +235,8 @@ def level_budget(
         bound = (off + above - math.expm1(quantile * by_chance)) / _RECTANGULAR
         parts.append(
             Component(
-                each.source, "B", "normal" if by_chance else "rectangular",
+                each.source, "A" if each.source is Source.GUSTS else "B",
+                "normal" if by_chance else "rectangular",
                 math.hypot(by_chance, bound), reach=(-below, above),
             )
         )  # fmt: skip

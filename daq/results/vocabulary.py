@@ -112,6 +112,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.LINEARITY: "squares and cubes of the motion",
     Source.COUNTS: "rounding that channels share",
+    Source.GUSTS: "noise in gusts",
     Source.FAULTY: "a faulty channel",
     Source.SENSITIVITY: "sensitivity",
     Source.TEMPERATURE: "temperature",

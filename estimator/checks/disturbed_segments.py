@@ -1,14 +1,10 @@
-"""Single segments: disturbed ones, gains that change from one to the next, noise that fluctuates.
+"""Single segments: disturbed ones, gains that change from one to the next, loudness of noise.
 
 A segment is disturbed if its residual beside the motion stands out. A sensor whose gain is by g off
 in a segment leaves g times the motion in its residual, at all frequencies; noise leaves at two
 frequencies what is independent. So products of what the motion explains of residuals, at different
 frequencies, have the mean g², whatever the noise does. Less those of one segment with a later one,
 they show what gains do that no part of time shows.
-
-So do products of the noise of a channel at different frequencies. Noise whose loudness changes
-faster than parts of time show, as in gusts, is not independent there: a mean over many frequencies
-is known no better than its loudness.
 """
 
 from __future__ import annotations
@@ -20,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.checks.loudness import LASTS, Loudness, across
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
@@ -34,14 +31,10 @@ RESTLESS = 3.0
 """Scatter of single segments over that of steady noise, from which none is disturbed."""
 LATER = 2
 """Segments after which a gain that drifts is the same: those between overlap both."""
-LASTS = 4
-"""The same for the loudness of noise; parts of time show what lasts much longer."""
 TOGETHER = 4
 """Segments whose products are averaged before their scatter is measured: neighbours overlap."""
 UNSTABLE = 4.5
 """Standard errors from which gains change from segment to segment."""
-FLUCTUATES = 3.0
-"""The same for the loudness of noise: it widens intervals, and nothing is said of it."""
 LARGEST = 0.5
 """Variance of a gain over the largest of all, from which it is no part of that in the motion."""
 MAX_DISTURBED = 0.2
@@ -84,9 +77,8 @@ class SegmentFindings:
     gains, sure : float64, shape (n_sensors,)
         Variance of the gains of a sensor between segments, 0 unless significant; over its standard
         error.
-    loudness : float64, shape (n_channels,)
-        Variance of a mean of the noise over time, times the number of segments, that all
-        frequencies have in common, as a share of its square; 0 unless significant.
+    loudness : Loudness
+        Of the noise.
     """
 
     disturbed: BoolArray
@@ -94,14 +86,14 @@ class SegmentFindings:
     is_restless: bool
     gains: FloatArray
     sure: FloatArray
-    loudness: FloatArray
+    loudness: Loudness
 
     @classmethod
     def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
         """Return findings of segments that show nothing."""
         disturbed, excess = np.zeros(n_segments, np.bool_), np.zeros((1, sum(dims)))
         nothing = np.zeros(len(dims))
-        return cls(disturbed, excess, False, nothing, nothing, np.zeros(sum(dims)))
+        return cls(disturbed, excess, False, nothing, nothing, Loudness.steady(sum(dims)))
 
 
 def segment_findings(
@@ -138,8 +130,11 @@ def segment_findings(
     groups = groups[:n_good]
     if not groups:
         return found
+    step = float(np.median(np.diff(course.times)))
     mixing = np.stack([(np.abs(residuals.projector[group]) ** 2).sum(axis=0) for group in groups])
-    found = replace(found, loudness=_loudness(np.stack(powers[:n_good]), mixing))
+    found = replace(
+        found, loudness=Loudness.of(np.stack(powers[:n_good]), mixing, step, lasts=LASTS)
+    )
     degrees = np.array([own[group].sum() for group in groups])
     out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)
     found = replace(found, is_restless=not calm.all())
@@ -183,46 +178,13 @@ class _Gains:
             return np.zeros(n_sensors), np.zeros(n_sensors)
         score, weight = np.stack(self._score), np.stack(self._weight)
         for sign, later in ((1, 0), (-1, LATER)):
-            along, known = (_across(e[:, :n], e[:, later : later + n]) for e in (score, weight))
+            along, known = (across(e[:, :n], e[:, later : later + n]) for e in (score, weight))
             found += sign * along / known.sum(axis=0)
         blocks = found[: n_blocks * TOGETHER].reshape(n_blocks, TOGETHER, -1).sum(axis=1)
         total, sure = found.sum(axis=0), blocks.mean(axis=0) / blocks.std(axis=0, ddof=1)
         sure *= math.sqrt(n_blocks)
         is_seen = (sure > UNSTABLE) & (total > LARGEST * total.max())
         return np.where(is_seen, total, 0.0), sure
-
-
-def _loudness(power: FloatArray, mixing: FloatArray) -> FloatArray:
-    """Return `loudness` of `SegmentFindings`.
-
-    Parameters
-    ----------
-    power : float64, shape (n_groups, n_segments, n_channels)
-        Of the residuals.
-    mixing : float64, shape (n_groups, n_channels, n_channels)
-        Part of the noise of every channel in these.
-    """
-    n_groups, n = len(power), power.shape[1] - LASTS
-    if n_groups == 1 or n < LASTS:
-        return np.zeros(power.shape[2])
-    own = power @ np.linalg.pinv(mixing).swapaxes(1, 2)
-    mean = own.mean(axis=1, keepdims=True)
-    apart = np.where(mean > 0, own / np.where(mean > 0, mean, 1.0) - 1, 0.0)
-    n_pairs = n_groups * (n_groups - 1)
-    now, *soon, later = (
-        _across(apart[:, :n], apart[:, lag : lag + n]).mean(axis=0) / n_pairs
-        for lag in range(LASTS + 1)
-    )
-    by_chance = 2 * (apart**2).mean(axis=(0, 1)) / math.sqrt(n_pairs * n)
-    seen = now - later > FLUCTUATES * by_chance
-    return np.where(
-        seen, np.maximum(now - later + 2 * np.sum(soon - later, axis=0), now - later), 0
-    )
-
-
-def _across(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the sum of products of different groups, the first axis."""
-    return np.asarray(one.sum(axis=0) * other.sum(axis=0) - (one * other).sum(axis=0))
 
 
 class _Residuals:

@@ -30,6 +30,7 @@ from estimator.checks.disturbed_segments import (
     SegmentFindings,
     segment_findings,
 )
+from estimator.checks.loudness import Loudness
 from estimator.checks.steadied import Steadied, steadied
 from estimator.checks.steadiness import (
     FALSE_ALARM,
@@ -153,9 +154,8 @@ class Stability:
         That channel.
     is_restless : bool
         Whether the noise changes from segment to segment, at some frequencies.
-    common : float64, shape (n_bands, n_channels)
-        Variance of the mean noise that all frequencies have in common, as a share of its square,
-        since its loudness changes from segment to segment.
+    loudness : Loudness or None
+        Of the noise, which all frequencies have in common; None where it is not known.
     steadied : tuple of Steadied or None
         Averages without the changes of responses, of each range of frequencies; None where nothing
         tells of any.
@@ -175,7 +175,7 @@ class Stability:
     excess: float = field(metadata={"key": "excess_share"})
     channel: int
     is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
-    common: FloatArray = field(default_factory=lambda: np.zeros((1, 1)), metadata=NOT_IN_JSON)
+    loudness: Loudness | None = field(default=None, metadata=NOT_IN_JSON)
     steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
 
     @property
@@ -207,6 +207,7 @@ class Stability:
                 clearest[each.sensor] = each
                 second_order += each.statistic * each.size**2
         runs = [each.runs for each in found if each.runs is not None]
+        known = [each.loudness for each in found if each.loudness is not None]
         added = np.stack([each.added for each in found]).max(axis=0) * float(is_added)
         return replace(
             found[-1],
@@ -217,7 +218,7 @@ class Stability:
             inflations=np.concatenate([each.inflations for each in found]),
             changes=tuple(clearest.values()),
             added=added,
-            common=np.concatenate([each.common for each in found]),
+            loudness=functools.reduce(Loudness.joined, known) if known else None,
             explained=np.concatenate([each.explained for each in found]),
             within=np.concatenate([each.within for each in found]),
             steadied=tuple(
@@ -230,10 +231,6 @@ class Stability:
     def inflation_at(self, frequency: FloatArray) -> FloatArray:
         """Return the inflation at frequencies, shape (n_freqs,); 1 outside of the bands."""
         return 1 + self._at(frequency, self.inflations[:, None] - 1)[:, 0]
-
-    def common_at(self, frequency: FloatArray) -> FloatArray:
-        """Return `common` at frequencies, shape (n_freqs, n_channels); 0 outside of the bands."""
-        return self._at(frequency, self.common)
 
     def changed_at(self, frequency: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the share of the noise that changes of responses may be, (n_freqs, n_channels).
@@ -260,16 +257,15 @@ class Stability:
         """Return the same with channels and sensors numbered among all, dead ones included."""
         added = np.zeros(n_channels)
         added[list(channels)] = self.added
-        explained, within, common = np.zeros((3, len(self.low), n_channels))
+        explained, within = np.zeros((2, len(self.low), n_channels))
         explained[:, list(channels)], within[:, list(channels)] = self.explained, self.within
-        common[:, list(channels)] = self.common
         return replace(
             self,
             parts=self.parts.among(channels, n_channels),
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
-            common=common,
+            loudness=self.loudness and self.loudness.among(channels, n_channels),
             explained=explained,
             within=within,
             steadied=self.steadied if len(channels) == n_channels else (),
@@ -397,6 +393,7 @@ def stability(
         if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS
         else SegmentFindings.none(0, dims)
     )
+    loudness = single.loudness.joined(Loudness.of_parts(parts, maximum, psd, good))
     changes, added, left = _and_unstable(
         (changes, added),
         single,
@@ -420,7 +417,7 @@ def stability(
         if kept.sum() >= MIN_PARTS:
             bands = [None if band is None else band.of_parts(kept) for band in bands]
             levels = [None if band is None else band.levels for band in bands]
-    elif not (changes or suspect) and all(each is None for each in levels):
+    elif not (changes or suspect or loudness.size.any()) and all(e is None for e in levels):
         return None
     within = np.full_like(explained, np.nan) if without is None else without.within
     within[:, left.any(axis=0)] = np.nan  # parts do not show it
@@ -443,7 +440,7 @@ def stability(
         excess=float(single.excess.max()),
         channel=int(single.excess.max(axis=0).argmax()),
         is_restless=single.is_restless,
-        common=np.tile(single.loudness / n_effective, (len(low), 1)),
+        loudness=loudness,
         steadied=() if without is None else (without,),
     )
 

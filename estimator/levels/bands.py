@@ -85,7 +85,6 @@ def band_levels(
     correlation: FloatArray,
     *,
     weights: FloatArray | None = None,
-    common: FloatArray | None = None,
 ) -> BandLevels:
     """Average the noise of channels over bands of bins.
 
@@ -101,8 +100,6 @@ def band_levels(
         From :func:`bin_correlation`.
     weights : float64, shape (n_freqs,) or (n_freqs, n_channels), optional
         Weights of the bins in the mean, such as their `widths`.
-    common : float64, shape (n_freqs, n_channels), optional
-        Variance that all bins have in common, as a share of the square of the noise.
 
     Returns
     -------
@@ -134,9 +131,6 @@ def band_levels(
             variance += 2 * correlation[lag] * np.add.reduceat(pairs, starts, axis=0)
         excess = np.where(added[0] > 0, variance / added[0], 1.0)
         found = np.stack([added[m] * excess ** (m + 1) / total ** (m + 2) for m in range(3)])
-    if common is not None:
-        most = np.maximum.reduceat(common[first:last], starts, axis=0)
-        found += np.stack([mean**k * most ** (k - 1) for k in (2, 3, 4)])
     return BandLevels(mean, found, np.logical_and.reduceat(known, starts, axis=0))
 
 

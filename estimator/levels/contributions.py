@@ -57,6 +57,8 @@ class Source(enum.StrEnum):
     """Like channels are rounded to counts alike, and share a part of that."""
     CHANGES = "changes"
     """The gain or the direction of the sensor changed: motion is left in its noise."""
+    GUSTS = "gusts"
+    """The loudness of the noise changes at all frequencies: a mean over these scatters with it."""
     FAULTY = "faulty"
     """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
     SENSITIVITY = "sensitivity"

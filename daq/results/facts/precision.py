@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from estimator.checks.relative_response import pair_coherence
 from estimator.errors import BandError
 from estimator.levels.contributions import Source
 from estimator.levels.interval import NORMAL_95
-from estimator.records import Degrees, Seconds
-from estimator.wording import Words, listed, measured, percent, roughly, span
+from estimator.records import Degrees, Seconds, Share
+from estimator.wording import Words, few, listed, measured, percent, roughly, span
 
+MUCH_WIDER = 0.1
+"""Share by which intervals are wider from which that is a fact."""
 _TWO = 2  # sensors
 
 
@@ -84,6 +87,35 @@ class IntervalsWidened(Fact):
         return Words(text, f"{text}.")
 
 
+class NoiseInGusts(Fact):
+    """The loudness of the noise of `channels` changes, at all frequencies; the worst come first.
+
+    Attributes
+    ----------
+    size : float
+        Its standard deviation in the first channel, as a share of the noise.
+    lasts : float
+        Its duration there, s; no more is known of shorter changes.
+    wider : float
+        By how much intervals of the tables are wider, at most, as a share of those without.
+    """
+
+    size: Share
+    lasts: Seconds
+    wider: Share
+
+    def _words(self) -> Words:
+        gusts = f"in gusts: ±{percent(self.size)} for up to {roughly(self.lasts)}"
+        channels, wider = few(list(self.channels)), f"{percent(self.wider)} wider"
+        return Words(
+            f"Noise of {channels} {gusts}; intervals {wider}",
+            f"The noise of {channels} comes {gusts}, at all frequencies. Its mean over time is"
+            f" known no better than its loudness: intervals are up to {wider} than those of steady"
+            " noise.",
+            "Record longer, or keep what shakes these channels away.",
+        )
+
+
 class TargetMissed(Fact):
     """The wanted precision is not reached.
 
@@ -104,6 +136,31 @@ class TargetMissed(Fact):
             return Words(f"{text}: record longer", f"{text}.", "Record longer.")
         long = roughly(self.total)
         return Words(f"{text}: record for {long} in all", f"{text}.", f"Record for {long} in all.")
+
+
+def _in_gusts(estimate: Estimate) -> Iterator[NoiseInGusts]:
+    """Yield channels whose intervals are wider by the loudness of their noise."""
+    snapshot, loudness = estimate.snapshot, estimate.snapshot.diagnostics.loudness
+    if loudness is None or estimate.noise is None:
+        return
+    ends = [
+        np.array([[each.low[0], each.high[0]] for each in found])
+        for without in ((), (Source.GUSTS,))
+        for found in [estimate.means(estimate.method, without=frozenset(without))]
+    ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        wider = np.divide(*(np.diff(each)[:, 0] for each in ends)) - 1
+    wider = np.nan_to_num(wider, posinf=0.0)
+    some = [n for n in np.argsort(-wider).tolist() if wider[n] > MUCH_WIDER]
+    if some:
+        yield NoiseInGusts(
+            rank=Rank.TO_KNOW,
+            channels=tuple(snapshot.channels[n].name for n in some),
+            band=estimate.band,
+            size=float(loudness.size[some[0]]),
+            lasts=float(loudness.lasts[some[0]]),
+            wider=float(wider[some[0]]),
+        )
 
 
 def _within(value: float, error: float, digits: int) -> str:
@@ -143,6 +200,8 @@ def _compared(estimate: Estimate) -> Iterator[PairCompared]:
 def facts_of_precision(estimate: Estimate) -> Iterator[Fact]:
     """Yield how two sensors compare, what widens intervals, and whether a target is reached."""
     yield from _compared(estimate)
+    with suppress(BandError):
+        yield from _in_gusts(estimate)
     for method in estimate.snapshot.results:
         if shares := widening(estimate, method):
             rank = Rank.TO_KNOW

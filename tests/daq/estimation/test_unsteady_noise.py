@@ -10,8 +10,11 @@ from scipy import signal
 
 import huddle
 from daq.estimation import snapshot_builder
+from daq.estimation.estimation import estimate
 from daq.estimation.noise_estimates import Estimates, noise_estimates
 from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
+from daq.results.facts.precision import NoiseInGusts
 from daq.results.result import Result
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
@@ -55,6 +58,28 @@ def test_intervals_cover_the_mean_noise(case: str, sensor: int, covered: float) 
         low, high = found.low[inside, own], found.high[inside, own]
         hits.append(np.mean((low <= truth[sensor]) & (truth[sensor] <= high)))
     assert np.mean(hits) > covered
+
+
+@pytest.mark.parametrize("by", [{}, {"octaves": True}, {"reject": True}])
+def test_a_mean_over_many_frequencies_is_known_no_better_than_its_loudness(
+    by: dict[str, bool],
+) -> None:
+    """Gusts of 3 s, 9.5 dB: the variance is 1.74 for 5.2 s, a mean over 1200 s has .087 (1 σ)."""
+    settings, rng = Settings(segment=2.0, **by), np.random.default_rng(3)  # type: ignore[arg-type]
+    motion = 30 * rng.standard_normal((N, 3))
+    samples = {
+        name: motion + level_of(name, "gusts")[:, None] * rng.standard_normal((N, 3))
+        for name in "ABC"
+    }
+    found = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    (gusts,) = [fact for fact in found.facts if isinstance(fact, NoiseInGusts)]
+    assert {name[0] for name in gusts.channels} == {"C"}
+    assert gusts.wider > 1
+    assert 2 < gusts.lasts <= 100  # two parts
+    spread = [float(each.high[0] / each.low[0]) for each in found.means(found.method, (2, 18))]
+    assert max(spread[:6]) < 1.15
+    # of its standard deviation, by 12 parts at least, 16 % (1 σ)
+    assert np.log(np.mean(spread[6:])) == pytest.approx(2 * 1.96 * 0.087, rel=3 * 0.16 + 0.1)
 
 
 @pytest.mark.parametrize(("n_sensors", "ratio"), [(3, 0.2), (5, 0.2), (3, 1e4)])

@@ -145,7 +145,7 @@ def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> Non
 def test_loudness_that_changes_from_segment_to_segment_is_no_independent_scatter() -> None:
     """Noise of variance .4 between segments, at all frequencies; of steady noise, by chance none.
 
-    Three standard errors are exceeded in .13 % of 100 channels; three or more have odds of 4e-4.
+    Of 100 channels .02 are by chance louder; three or more have odds of 1e-6.
     """
     seen = []
     for seed, change in product(range(20), (0.4, 0.0)):
@@ -156,7 +156,8 @@ def test_loudness_that_changes_from_segment_to_segment_is_no_independent_scatter
         csm = np.einsum("sfp,sfq->fpq", spectra, spectra.conj()) / len(spectra)
         course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
         good = np.ones(48, np.bool_)
-        seen.append(segment_findings(course, maximise(csm, 1), good, (1, 1, 1)).loudness)
+        found = segment_findings(course, maximise(csm, 1), good, (1, 1, 1)).loudness
+        seen.append(200 * found.deviation**2)
     restless, steady = np.array(seen[::2]), np.array(seen[1::2])
     # the variance of 200 draws of a gamma variable of kurtosis 5.4: 16 %, of 20 means 4 %
     assert restless[:, 1].mean() == pytest.approx(0.4, abs=4 * 0.4 * 0.04)

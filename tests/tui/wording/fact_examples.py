@@ -65,7 +65,7 @@ from daq.results.facts.model import (
     ModelUntested,
     SharedByTwo,
 )
-from daq.results.facts.precision import IntervalsWidened, PairCompared, TargetMissed
+from daq.results.facts.precision import IntervalsWidened, NoiseInGusts, PairCompared, TargetMissed
 from daq.results.facts.recordings import (
     BlocksDamaged,
     ChannelsStuck,
@@ -251,6 +251,7 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     ValuesBelowZero(rank=Rank.TO_KNOW, method="three-sensor", n=5, n_values=900),
     IntervalsWidened(rank=Rank.TO_KNOW, method="three-sensor", shares={Source.CLOCKS: 0.05}),
+    NoiseInGusts(rank=Rank.TO_KNOW, channels=("A.X",), size=0.45, lasts=9.5, wider=1.1),
     TargetMissed(rank=Rank.DELAYS, cov=0.2, target=0.1, total=7200.0),
     WrongSensitivity(
         rank=Rank.INVALIDATES,
