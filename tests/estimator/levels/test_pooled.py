@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from estimator.levels.bands import band_levels
 from estimator.levels.interval import worth
-from estimator.levels.pooled import pooled_noise
-from estimator.methods import Flag, self_noise
+from estimator.levels.pooled import Pooled, pooled_noise
+from estimator.methods import Flag, SelfNoise, self_noise
 from estimator.self_noise.three_sensor import three_sensor
 from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import wishart
@@ -36,27 +38,60 @@ def drawn(rng: np.random.Generator, csm: ComplexArray, n: int) -> ComplexArray:
     return np.asarray(wishart(csm, n, rng)[0], np.complex128)
 
 
+def pooled(csm: ComplexArray, n: int, block: int = 1) -> Pooled:
+    """Return the noise of triaxial sensors, from blocks of as many bins."""
+    bins, p = csm.shape[:2]
+    return pooled_noise(
+        csm,
+        np.arange(bins) * block // bins,
+        np.full(bins, 3),
+        dims=(3,) * (p // 3),
+        n_effective=n,
+        correlation=ONE,
+    )
+
+
+def beside(
+    csm: ComplexArray,
+    n: int,
+    d: int = 3,
+    method: str = "three-sensor",
+    **options: Any,  # noqa: ANN401 - those of self_noise
+) -> SelfNoise:
+    """Return the noise of sensors of d channels, with all bins as neighbours."""
+    options.setdefault("blocks", np.zeros(len(csm), np.int64))
+    return self_noise(method, csm, dims=(d,) * (csm.shape[1] // d), n_effective=n, **options)
+
+
+def judged(
+    found: Pooled | SelfNoise, noise: FloatArray
+) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    """Return whether the band's intervals hold the noise, its means over it, and their scores."""
+    psd = found.noise if isinstance(found, Pooled) else found.noise_psd
+    level = band_levels(psd, found.cumulants, np.array([0, len(psd)]), ONE)
+    low, high = level.interval()
+    held = (low[0] <= noise) & (noise <= high[0])
+    return held, level.mean[0] / noise, (level.mean[0] - noise) / level.spread[0]
+
+
+def least(n: int) -> float:
+    """Return how many of n intervals hold the noise: 95 % less four standard errors."""
+    return 0.95 - 4 * float(np.sqrt(0.05 * 0.95 / n))
+
+
 def coverage(
     snr: tuple[float, ...], noise: FloatArray, *, n: int, draws: int, sensors: int = 3
 ) -> tuple[float, float, float]:
     """Return coverage of bands and of bins, and the mean over the truth."""
-    d = len(snr)
     bands, bins, means = [], [], []
     for seed in range(draws):
         rng = np.random.default_rng([n, seed, sensors])
         sample = drawn(rng, scene(rng, snr, noise, sensors=sensors), n)
-        found = self_noise(
-            "three-sensor",
-            sample,
-            dims=(d,) * sensors,
-            n_effective=n,
-            blocks=np.zeros(N_BINS, np.int64),
-        )
-        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
-        low, high = level.interval()
-        bands.append((low[0] <= noise) & (noise <= high[0]))
+        found = beside(sample, n, len(snr))
+        held, mean, _ = judged(found, noise)
+        bands.append(held)
         bins.append((found.low <= noise) & (noise <= found.high))
-        means.append(level.mean[0] / noise)
+        means.append(mean)
     return float(np.mean(bands)), float(np.mean(bins)), float(np.mean(means))
 
 
@@ -68,8 +103,7 @@ def coverage(
 def test_levels_of_bands_and_bins_are_covered(snr: tuple[float, ...]) -> None:
     noise = np.ones(9)
     bands, bins, mean = coverage(snr, noise, n=189, draws=12)
-    # 108 levels of correlated channels: 95 % less four standard errors
-    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 108)
+    assert bands > least(108)  # levels of correlated channels
     assert 0.93 < bins < 0.97
     assert mean == pytest.approx(1, abs=0.015)
 
@@ -87,19 +121,10 @@ def test_what_the_channels_of_one_sensor_share_is_its_noise(sensors: int, snr: f
         axes = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(sensors)]
         H = np.concatenate(axes)
         csm = np.broadcast_to(snr * H @ H.T + noise, (40, *noise.shape))
-        found = pooled_noise(
-            drawn(rng, csm, 189),
-            np.zeros(40, np.int64),
-            np.full(40, 3),
-            dims=(3,) * sensors,
-            n_effective=189,
-            correlation=ONE,
-        )
-        level = band_levels(found.noise, found.cumulants, np.array([0, 40]), ONE)
-        low, high = level.interval()
-        held.append((low[0] <= true) & (true <= high[0]))
-        ratios.append((level.mean[0] / true)[3:5])
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / (24 * sensors))
+        inside, ratio, _ = judged(pooled(drawn(rng, csm, 189), 189), true)
+        held.append(inside)
+        ratios.append(ratio[3:5])
+    assert np.mean(held) > least(24 * sensors)
     assert np.mean(held, axis=0)[3:5].mean() > 0.7  # a diagonal model holds none of these
     # eight draws of 7560 averages: 0.4 % standard error
     np.testing.assert_allclose(np.mean(ratios, axis=0), 1.0, atol=0.02)
@@ -134,26 +159,17 @@ def coloured(kind: str, rng: np.random.Generator) -> ComplexArray:
 )
 def test_motion_that_differs_between_bins_is_removed(kind: str, ratio: float, sensors: int) -> None:
     """Where a bin lacks a direction, neither its noise is taken off, nor is motion left in."""
-    scores: list[FloatArray] = []
-    held: list[FloatArray] = []
+    held, scores = [], []
     for seed in range(6):
         rng = np.random.default_rng([seed, sensors])
         axes = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(sensors)]
         A = np.sqrt(ratio) * np.concatenate(axes) @ coloured(kind, rng)
-        found = pooled_noise(
-            drawn(rng, A @ A.conj().swapaxes(1, 2) + np.eye(3 * sensors), 300),
-            np.zeros(N_BINS, np.int64),
-            np.full(N_BINS, 3),
-            dims=(3,) * sensors,
-            n_effective=300,
-            correlation=ONE,
-        )
-        level = band_levels(found.noise, found.cumulants, EDGES, ONE)
-        low, high = level.interval()
-        held.append((low[0] <= 1) & (high[0] >= 1))
-        scores.append((level.mean[0] - 1) / level.spread[0])
+        sample = drawn(rng, A @ A.conj().swapaxes(1, 2) + np.eye(3 * sensors), 300)
+        inside, _, score = judged(pooled(sample, 300), np.ones(3 * sensors))
+        held.append(inside)
+        scores.append(score)
     n = 18 * sensors
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / n)
+    assert np.mean(held) > least(n)
     # 6 draws of channels that hardly depend on one another
     assert np.square(scores).mean() < 1 + 4 * np.sqrt(2 / n)
     assert abs(np.mean(scores)) < 4 / np.sqrt(n)
@@ -177,20 +193,13 @@ def test_what_differs_in_a_few_bins_of_one_sensor(
         else:
             gain = np.array([2.0, 3.0, 5.0, 3.0, 2.0]) ** (1 if kind == "resonance" else -2)
             A[28:33, :3] *= (gain * np.exp(1j * np.linspace(0, 3, 5)))[:, None, None]
-        found = self_noise(
-            "three-sensor" if sensors == 3 else "maximum-likelihood",
-            drawn(rng, A @ A.conj().swapaxes(1, 2) + noise, 300),
-            dims=(3,) * sensors,
-            n_effective=300,
-            blocks=np.zeros(N_BINS, np.int64),
-        )
-        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
-        low, high = level.interval()
-        true = np.einsum("fcc->fc", noise).mean(axis=0)
-        held.append((low[0] <= true) & (true <= high[0]))
-        scores.append((level.mean[0] - true) / level.spread[0])
+        method = "three-sensor" if sensors == 3 else "maximum-likelihood"
+        found = beside(drawn(rng, A @ A.conj().swapaxes(1, 2) + noise, 300), 300, method=method)
+        inside, _, score = judged(found, np.einsum("fcc->fc", noise).mean(axis=0))
+        held.append(inside)
+        scores.append(score)
     n = 18 * sensors
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / n)
+    assert np.mean(held) > least(n)
     assert np.square(scores).mean() < 1 + 4 * np.sqrt(2 / n)
 
 
@@ -198,14 +207,7 @@ def test_each_block_has_the_dimensions_of_its_own_motion() -> None:
     """Strong motion, none, and motion again: none of it is in the noise of its neighbours."""
     rng = np.random.default_rng(3)
     true = np.concatenate([scene(rng, (snr,) * 3, np.ones(9)) for snr in (1e3, 0.0, 30.0)])
-    found = pooled_noise(
-        drawn(rng, true, 189),
-        np.repeat(np.arange(3), N_BINS),
-        np.full(3 * N_BINS, 3),
-        dims=(3,) * 3,
-        n_effective=189,
-        correlation=ONE,
-    )
+    found = pooled(drawn(rng, true, 189), 189, block=3)
     level = band_levels(found.noise, found.cumulants, np.arange(4) * N_BINS, ONE)
     # 61 bins of 189 averages: standard error 0.9 % of a channel, 0.3 % of the mean of nine
     np.testing.assert_allclose(level.mean.mean(axis=1), 1.0, atol=0.015)
@@ -221,23 +223,15 @@ def test_a_line_of_one_sensor_is_not_taken_for_motion() -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         sample = drawn(rng, scene(rng, (10.0,) * 3, np.ones(9)) + line, 189)
-        found = pooled_noise(
-            sample,
-            np.zeros(N_BINS, np.int64),
-            np.full(N_BINS, 3),
-            dims=(3,) * 3,
-            n_effective=189,
-            correlation=ONE,
-        )
+        found = pooled(sample, 189)
         ratios.append((found.noise / noise)[30:33])
-        level = band_levels(found.noise, found.cumulants, EDGES, ONE)
-        low, high = level.interval()
-        held.append((low[0] <= noise.mean(axis=0)) & (noise.mean(axis=0) <= high[0]))
-        levels.append(level.mean[0] / noise.mean(axis=0))
+        inside, level, _ = judged(found, noise.mean(axis=0))
+        held.append(inside)
+        levels.append(level)
     # three bins of twelve draws of 189 averages: standard error 1.5 %; motion leaks a little
     np.testing.assert_allclose(np.mean(ratios, axis=(0, 1)), 1.0, atol=0.1)
     np.testing.assert_allclose(np.mean(levels, axis=0), 1.0, atol=0.02)
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 108)
+    assert np.mean(held) > least(108)
 
 
 def test_motion_shows_beside_strong_noise_of_one_sensor() -> None:
@@ -250,24 +244,19 @@ def test_motion_shows_beside_strong_noise_of_one_sensor() -> None:
         axes = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
         csm = (axes * [0.1, 0.14, 0.07]) @ axes.T + np.eye(9) + within
         sample = drawn(rng, np.broadcast_to(csm, (40, 9, 9)).astype(np.complex128), 60)
-        found = self_noise(
-            "three-sensor", sample, dims=(3,) * 3, n_effective=60, blocks=np.zeros(40, np.int64)
-        )
-        level = band_levels(found.noise_psd, found.cumulants, np.array([0, 40]), ONE)
-        low, high = level.interval()
-        held.append((low[0] <= noise) & (noise <= high[0]))
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 360)
+        held.append(judged(beside(sample, 60), noise)[0])
+    assert np.mean(held) > least(360)
 
 
 @pytest.mark.parametrize("snr", [0.0, 0.02, 0.05])
 def test_motion_that_hardly_shows_is_in_the_interval(snr: float) -> None:
     bands, _, _ = coverage((snr,) * 3, np.ones(9), n=189, draws=8)
-    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 72)
+    assert bands > least(72)
 
 
 def test_few_averages_are_covered() -> None:
     bands, bins, _ = coverage((0.3, 0.3), np.ones(6), n=12, draws=20)
-    assert bands > 0.95 - 4 * np.sqrt(0.05 * 0.95 / 120)
+    assert bands > least(120)
     assert 0.93 < bins < 0.985
 
 
@@ -278,13 +267,7 @@ def test_a_quiet_sensor_is_known_to_a_few_times_its_noise() -> None:
     for seed in range(6):
         rng = np.random.default_rng(seed)
         sample = drawn(rng, scene(rng, (0.3,) * 3, noise), 189)
-        found = self_noise(
-            "three-sensor",
-            sample,
-            dims=(3,) * 3,
-            n_effective=189,
-            blocks=np.zeros(N_BINS, np.int64),
-        )
+        found = beside(sample, 189)
         _, high = band_levels(found.noise_psd, found.cumulants, EDGES, ONE).interval()
         reach.append(high[0, :3] / noise[:3])
     assert np.median(reach) < 20
@@ -298,27 +281,13 @@ def test_by_name_three_sensor_is_the_paper_s_formula(n: int, snr: float, own: in
     plain = three_sensor(sample, dims=(3,) * 3, n_effective=n)
     np.testing.assert_array_equal(by_name.noise_psd, plain.noise_psd)
     assert not (by_name.flags & Flag.POOLED).any()
-    levels = self_noise(
-        "three-sensor",
-        sample,
-        dims=(3,) * 3,
-        n_effective=n,
-        blocks=np.zeros(N_BINS, np.int64),
-        known=by_name,
-    )
+    levels = beside(sample, n, known=by_name)
     assert not np.array_equal(levels.noise_psd, plain.noise_psd)
     assert ((levels.flags & Flag.POOLED) == (0 if own else Flag.POOLED)).all()
 
 
 def test_too_few_averages_for_a_block_give_nothing() -> None:
-    found = pooled_noise(
-        np.broadcast_to(np.eye(9, dtype=np.complex128), (2, 9, 9)),
-        np.zeros(2, np.int64),
-        np.full(2, 3),
-        dims=(3, 3, 3),
-        n_effective=4,
-        correlation=ONE,
-    )
+    found = pooled(np.broadcast_to(np.eye(9, dtype=np.complex128), (2, 9, 9)), 4)
     assert np.isnan(found.noise).all()
 
 
@@ -327,13 +296,7 @@ def test_a_channel_that_is_the_sum_of_two_others_stops_nothing() -> None:
     sample = drawn(rng, scene(rng, (1e3,) * 3, np.ones(9)), 40)
     sum_of = np.eye(9)
     sum_of[6] = sum_of[0] + sum_of[3]
-    found = self_noise(
-        "three-sensor",
-        np.asarray(sum_of @ sample @ sum_of.T, np.complex128),
-        dims=(3,) * 3,
-        n_effective=40,
-        blocks=np.zeros(N_BINS, np.int64),
-    )
+    found = beside(np.asarray(sum_of @ sample @ sum_of.T, np.complex128), 40)
     assert np.isfinite(found.noise_psd).all()
 
 
@@ -354,20 +317,13 @@ def test_sensors_off_plumb_are_known_although_motion_has_more_dimensions(p: int)
         rng = np.random.default_rng(seed)
         axes = np.column_stack([np.ones(p), 0.0123 * rng.standard_normal((p, 2))])
         csm = 5e4 * axes @ axes.T + np.eye(p)
-        found = self_noise(
-            "maximum-likelihood",
-            drawn(rng, np.broadcast_to(csm, (N_BINS, p, p)).astype(np.complex128), 200),
-            dims=(1,) * p,
-            n_effective=200,
-            n_factors=3,
-            blocks=np.zeros(N_BINS, np.int64),
-        )
-        level = band_levels(found.noise_psd, found.cumulants, EDGES, ONE)
-        low, high = level.interval()
+        sample = drawn(rng, np.broadcast_to(csm, (N_BINS, p, p)).astype(np.complex128), 200)
+        found = beside(sample, 200, 1, "maximum-likelihood", n_factors=3)
         assert (found.flags & Flag.POOLED).all()
-        held.append((low[0] <= noise) & (noise <= high[0]))
-        ratios.append(level.mean[0])
-    assert np.mean(held) > 0.95 - 4 * np.sqrt(0.05 * 0.95 / (12 * p))
+        inside, ratio, _ = judged(found, noise)
+        held.append(inside)
+        ratios.append(ratio)
+    assert np.mean(held) > least(12 * p)
     assert np.mean(ratios) == pytest.approx(1, abs=0.02)
 
 
@@ -379,13 +335,7 @@ def test_more_dimensions_than_were_chosen_do_not_narrow_the_intervals() -> None:
     csm = (axes * strengths[:, None, :]) @ axes.T + np.eye(12)
     held = []
     for _ in range(8):
-        found = self_noise(
-            "maximum-likelihood",
-            drawn(rng, csm.astype(np.complex128), 100),
-            dims=(1,) * 12,
-            n_effective=100,
-            n_factors=np.repeat([1, 2], 40),
-            blocks=np.repeat([0, 1], 40),
-        )
+        sample, both = drawn(rng, csm.astype(np.complex128), 100), np.repeat([0, 1], 40)
+        found = beside(sample, 100, 1, "maximum-likelihood", n_factors=1 + both, blocks=both)
         held.append((found.low[:40] <= 1) & (found.high[:40] >= 1))
     assert np.mean(held) == pytest.approx(0.95, abs=0.02)
