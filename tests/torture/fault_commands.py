@@ -59,53 +59,32 @@ def commands(inputs: Path) -> dict[str, Command]:
     def copies(*names: str) -> Callable[[Path], object]:
         return lambda disk: [shutil.copy(inputs / name, disk / name) for name in names]
 
-    def of(*words: str) -> Callable[[Path], list[str]]:
-        return lambda disk: [word.replace("DISK", str(disk)) for word in words]
-
-    options = ("--segment", "10s", "--method", "three-sensor")
+    night, options = copies("night.h5"), "--segment 10s --method three-sensor"
+    days = f"archive DISK/day-0.h5 DISK/day-1.h5 --store DISK/store {options} --json DISK/a.json"
+    issue = f"issue DISK/night.h5 --by 'Grace Hopper' --bench DISK/bench.toml --despite '{DESPITE}'"
     made = [
         Command(
             "estimate",
-            copies("night.h5"),
-            of(
-                "estimate",
-                "DISK/night.h5",
-                *options,
-                "--json",
-                "DISK/r.json",
-                "--csv",
-                "DISK/r.csv",
-            ),
+            f"estimate DISK/night.h5 {options} --json DISK/r.json --csv DISK/r.csv",
             _found({"r.json": _json("channels", "methods"), "r.csv": _text}),
+            night,
         ),
         Command(
-            "results in a recording",
-            copies("night.h5"),
-            of("store", "DISK/night.h5"),
-            _found({"night.h5": _results}),
+            "results in a recording", "store DISK/night.h5", _found({"night.h5": _results}), night
         ),
-        Command(
-            "archive",
-            copies("day-0.h5", "day-1.h5"),
-            of(
-                *("archive", "DISK/day-0.h5", "DISK/day-1.h5", "--store", "DISK/store"),
-                *(*options, "--json", "DISK/a.json"),
-            ),
-            _archived,
-        ),
+        Command("archive", days, _archived, copies("day-0.h5", "day-1.h5")),
         Command(
             "import",
-            lambda _: None,
-            of("import", str(inputs / "counts.npz"), "--out", "DISK/r.h5"),
+            f"import '{inputs}/counts.npz' --out DISK/r.h5",
             _found({"r.h5": _samples}),
             needs_free_name=True,
         ),
         *(
             Command(
                 f"export {kind}",
-                copies("night.h5"),
-                of("export", "DISK/night.h5", "--format", kind, "--out", f"DISK/e{suffix}", *more),
+                f"export DISK/night.h5 --format {kind} --out DISK/e{suffix} {more}",
                 _found({f"e{suffix}": read, **beside}),
+                night,
             )
             for kind, suffix, read, more, beside in (
                 ("csv", ".csv", _text, options, {"e.csv-metadata.json": _text}),
@@ -114,50 +93,40 @@ def commands(inputs: Path) -> dict[str, Command]:
                 ("mat", ".mat", _matlab, options, {}),
                 ("npz", ".npz", _npz, options, {}),
                 ("uff58", ".uff", _bytes, options, {}),
-                ("mseed", ".mseed", _bytes, (), {"e.xml": _station}),
+                ("mseed", ".mseed", _bytes, "", {"e.xml": _station}),
             )
         ),
         Command(
             "issue",
-            lambda disk: shutil.copytree(inputs / "laboratory", disk, dirs_exist_ok=True),
-            of(
-                *("issue", "DISK/night.h5", "--by", "Grace Hopper", "--bench", "DISK/bench.toml"),
-                *("--despite", DESPITE),
-            ),
+            issue,
             _certified,
+            lambda disk: shutil.copytree(inputs / "laboratory", disk, dirs_exist_ok=True),
             needs_free_name=True,
         ),
         Command(
             "report",
-            copies("night.h5"),
-            of("report", "DISK/night.h5", *options, "--out", "DISK/r.html"),
+            f"report DISK/night.h5 {options} --out DISK/r.html",
             _found({"r.html": _page}),
+            night,
         ),
         Command(
             "sign",
-            copies("night.h5", "lab.key"),
-            of("sign", "DISK/night.h5", "--key", "DISK/lab.key"),
+            "sign DISK/night.h5 --key DISK/lab.key",
             _found({"night.sig": _json("root_sha256", "public_key")}),
+            copies("night.h5", "lab.key"),
         ),
         Command(
             "sign --new-key",
-            lambda _: None,
-            of("sign", "--new-key", "DISK/k"),
+            "sign --new-key DISK/k",
             _found({"k": _size, "k.pub": _size}),
             needs_free_name=True,
         ),
-        Command(
-            "writer of recordings",
-            lambda _: None,
-            of("write", "DISK/r.h5"),
-            _written,
-            records="r.h5",
-        ),
+        Command("writer of recordings", "write DISK/r.h5", _written, records="r.h5"),
         Command(
             "repair",
-            copies("killed.h5", journal_path(inputs / "killed.h5").name),
-            of("repair", "DISK/killed.h5"),
+            "repair DISK/killed.h5",
             _found({"killed.h5": _repaired}),
+            copies("killed.h5", journal_path(inputs / "killed.h5").name),
         ),
     ]
     return {each.name: each for each in made}
@@ -165,10 +134,7 @@ def commands(inputs: Path) -> dict[str, Command]:
 
 def device_commands(bench: Path) -> dict[str, Command]:
     """Return the commands that record from the devices of a bench file, by name."""
-    duration = ("--duration", "12s", "--out", "DISK/r.h5")
-
-    def of(*words: str) -> Callable[[Path], list[str]]:
-        return lambda disk: [word.replace("DISK", str(disk)) for word in words]
+    recorded = f"'{bench}' --duration 12s --out DISK/r.h5"
 
     def scheduled(disk: Path) -> None:
         begin = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -180,21 +146,9 @@ def device_commands(bench: Path) -> dict[str, Command]:
         (disk / "bench.toml").write_text(dump(served), encoding="utf-8")
 
     made = [
-        Command(
-            "record",
-            lambda _: None,
-            of("record", str(bench), *duration),
-            _recorded,
-            records="r.h5",
-        ),
-        Command(
-            "run",
-            lambda _: None,
-            of("run", str(bench), *duration, "--json", "DISK/r.json"),
-            _run,
-            records="r.h5",
-        ),
-        Command("serve", scheduled, of("serve", "DISK/bench.toml"), _served),
+        Command("record", f"record {recorded}", _recorded, records="r.h5"),
+        Command("run", f"run {recorded} --json DISK/r.json", _run, records="r.h5"),
+        Command("serve", "serve DISK/bench.toml", _served, scheduled),
     ]
     return {each.name: each for each in made}
 

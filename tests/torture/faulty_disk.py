@@ -16,6 +16,7 @@ import json
 import mmap
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -128,12 +129,12 @@ class Command:
     Attributes
     ----------
     name : str
-    prepare : callable
-        Fills the disk.
-    arguments : callable
-        Of the command, for the disk.
+    words : str
+        What is typed; DISK stands for the disk.
     found : callable
         Numbers in each complete product on the disk, by its name; raises for one that is damaged.
+    prepare : callable
+        Fills the disk.
     needs_free_name : bool
         Whether it refuses to replace what it has made.
     records : str
@@ -141,11 +142,15 @@ class Command:
     """
 
     name: str
-    prepare: Callable[[Path], object]
-    arguments: Callable[[Path], list[str]]
+    words: str
     found: Callable[[Path], dict[str, Any]]
+    prepare: Callable[[Path], object] = lambda _: None
     needs_free_name: bool = False
     records: str = ""
+
+    def arguments(self, disk: Path) -> list[str]:
+        """Return those of the command."""
+        return [word.replace("DISK", str(disk)) for word in shlex.split(self.words)]
 
 
 @dataclass(slots=True)
