@@ -19,14 +19,22 @@ def like_psd(cov: float, n: int) -> FloatArray:
     return np.repeat([[cov**2], [cov**4], [cov**6]], n, axis=1)
 
 
+def margins_of(
+    margin: FloatArray, cov: float, clocks: float = 0.0, *, can_fail: bool = True
+) -> Margins:
+    n = len(margin)
+    return Margins(margin, like_psd(cov, n), np.full(n, clocks), np.zeros(n), np.full(n, can_fail))
+
+
+def predicted(margins: Margins, averages: float = 100.0, elapsed: float = 100.0) -> Prediction:
+    return predict(margins, quantile=QUANTILE, elapsed=elapsed, averages=averages, least=20.0)
+
+
 def prediction(
     margin: float, *, cov: float = 0.1, n: int = 50, clocks: float = 0.0, can_fail: bool = True
 ) -> Prediction:
     """Return the prediction for channels that are all as far from the limit."""
-    margins = Margins(
-        np.full(n, margin), like_psd(cov, n), np.full(n, clocks), np.zeros(n), np.full(n, can_fail)
-    )
-    return predict(margins, quantile=QUANTILE, elapsed=100.0, averages=100.0, least=20.0)
+    return predicted(margins_of(np.full(n, margin), cov, clocks, can_fail=can_fail))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -60,10 +68,7 @@ def test_what_clocks_may_have_added_does_not_fail_with_time() -> None:
 
 
 def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
-    margins = Margins(
-        np.full(9, 5.0), like_psd(0.3, 9), np.zeros(9), np.zeros(9), np.ones(9, dtype=bool)
-    )
-    found = predict(margins, quantile=QUANTILE, elapsed=10.0, averages=10.0, least=20.0)
+    found = predicted(margins_of(np.full(9, 5.0), 0.3), averages=10.0, elapsed=10.0)
     assert found.seconds is not None
     assert 20 <= found.seconds < 28
 
@@ -71,16 +76,7 @@ def test_too_few_averages_take_as_long_as_it_takes_to_have_enough() -> None:
 def test_it_says_which_channel_takes_longest_and_how_far_off_it_may_be() -> None:
     margin = np.full(9, 0.6)
     margin[4] = 0.25
-    known = [
-        predict(
-            Margins(margin, like_psd(cov, 9), np.zeros(9), np.zeros(9), np.ones(9, dtype=bool)),
-            quantile=QUANTILE,
-            elapsed=100.0,
-            averages=100.0,
-            least=20.0,
-        )
-        for cov in (0.2, 0.05)
-    ]
+    known = [predicted(margins_of(margin, cov)) for cov in (0.2, 0.05)]
     early, late = known
     assert [each.slowest for each in known] == [4, 4]
     assert all(each.is_pass for each in known)
@@ -98,8 +94,8 @@ def test_a_look_at_the_predicted_length_decides_as_likely_as_the_model_says(
     """Draws of the model of the module: the mean of true margins, these, the later estimate."""
     rng, cov, draws = np.random.default_rng(seed), 0.12, 40_000
     margin = rng.normal(0.35, 0.12, n)
-    margins = Margins(margin, like_psd(cov, n), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
-    found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
+    margins = margins_of(margin, cov)
+    found = predicted(margins, averages=1e4)
     mean, trust = margin, 1.0  # of one margin, nothing else is known
     if n > 1:
         variance = max(0.0, float(margin.var(ddof=1)) - cov**2)
@@ -130,8 +126,7 @@ def test_it_decides_as_often_as_it_says() -> None:
     for _ in range(150):
         truth = rng.normal(0.5, 0.15, n)
         now = truth + cov * rng.standard_normal(n)
-        margins = Margins(now, like_psd(cov, n), np.zeros(n), np.zeros(n), np.ones(n, dtype=bool))
-        found = predict(margins, quantile=QUANTILE, elapsed=100.0, averages=1e4, least=20.0)
+        found = predicted(margins_of(now, cov), averages=1e4)
         if found.seconds is None:
             continue
         n_predicted += 1

@@ -2,14 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from benchmarks.studies.draws import averaged
-from estimator.levels.bands import band_levels
+from estimator.levels.bands import BandLevels, band_levels
 from estimator.levels.pooled import LEAST_BINS, blocks_of
 from estimator.methods import self_noise
 from estimator.types import ComplexArray
+
+
+def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
+    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+
+def _turned(rng: np.random.Generator, n_sensors: int = 3) -> np.ndarray:
+    return np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(n_sensors)])
+
+
+def _averaged(x: ComplexArray) -> ComplexArray:
+    return np.asarray(np.einsum("fnp,fnq->fpq", x, x.conj()) / x.shape[1])
+
+
+def _levels(
+    csm: ComplexArray,
+    n: float,
+    edges: Sequence[int] | np.ndarray,
+    blocks: np.ndarray,
+    method: str = "maximum-likelihood",
+) -> BandLevels:
+    """Return the levels of triaxial sensors in bands, from directions that blocks share."""
+    dims = (3,) * (csm.shape[1] // 3)
+    found = self_noise(method, csm, dims=dims, n_effective=float(n), blocks=blocks)
+    return band_levels(found.noise_psd, found.cumulants, np.array(edges), np.ones(1))
 
 
 @pytest.mark.parametrize("steep", ["motion", "noise"])
@@ -23,18 +50,13 @@ def test_neighbours_count_rightly_where_levels_fall_within_a_block(steep: str) -
         level, noise = 1e4 * np.cos(np.pi / 2 * edge) ** 2, np.ones(n_freqs)
     else:  # from below the motion to above it
         level, noise = np.full(n_freqs, 0.3), (frequency / 8.0) ** -3.0
-    turned = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
-    means = []
+    turned = _turned(rng)
+    means, edges = [], np.array([40, 60, 75, 90, 110, 140, 180, 239])
     for _ in range(6):
         motion = np.sqrt(level / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 3))
         own = np.sqrt(noise / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 9))
-        x = motion @ turned.T + own
-        csm = np.einsum("fnp,fnq->fpq", x, x.conj()) / n
-        found = self_noise(
-            "three-sensor", csm, dims=(3, 3, 3), n_effective=n, blocks=blocks_of(frequency)
-        )
-        edges = np.array([40, 60, 75, 90, 110, 140, 180, 239])
-        held = band_levels(found.noise_psd, found.cumulants, edges, np.ones(1))
+        csm = _averaged(motion @ turned.T + own)
+        held = _levels(csm, n, edges, blocks_of(frequency), "three-sensor")
         low, high = held.interval()
         true = (np.add.reduceat(noise[:-1], edges[:-1]) / np.diff(edges))[:, None]
         means.append((held.mean / true, (low <= true) & (high >= true)))
@@ -59,10 +81,6 @@ def test_blocks_are_thirds_of_an_octave_with_bins_enough() -> None:
     assert sizes[-1] < 2 * sizes[-2]
 
 
-def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
-    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-
-
 @pytest.mark.parametrize(("ratio", "slopes"), [(0.01, 0.0), (0.03, 0.0), (0.02, 1.0)])
 def test_motion_too_weak_for_one_third_of_an_octave_is_found_with_others(
     ratio: float, slopes: float
@@ -72,21 +90,12 @@ def test_motion_too_weak_for_one_third_of_an_octave_is_found_with_others(
     n, n_freqs = 100.0, 400
     frequency = 0.1 * np.arange(1, n_freqs + 1, dtype=np.float64)
     noise = (frequency[:, None] / 6.0) ** rng.uniform(-slopes, slopes, 9)
-    turned = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
-    edges = np.array([10, 398])
+    turned = _turned(rng)
     errors, spreads = [], []
     for _ in range(6):
         motion = np.sqrt(ratio / 2) * _complex(rng, (n_freqs, int(n), 3))
         own = np.sqrt(noise / 2)[:, None] * _complex(rng, (n_freqs, int(n), 9))
-        x = motion @ turned.T + own
-        found = self_noise(
-            "maximum-likelihood",
-            np.einsum("fnp,fnq->fpq", x, x.conj()) / n,
-            dims=(3, 3, 3),
-            n_effective=n,
-            blocks=blocks_of(frequency),
-        )
-        held = band_levels(found.noise_psd, found.cumulants, edges, np.ones(1))
+        held = _levels(_averaged(motion @ turned.T + own), n, (10, 398), blocks_of(frequency))
         true = noise[10:398].mean(axis=0)
         errors.append(held.mean[0] / true - 1)
         spreads.append(held.spread[0] / true)
@@ -102,7 +111,7 @@ def test_motion_that_a_third_of_an_octave_resolves_is_not_looked_for_with_others
     n, n_freqs = 30, 400
     frequency = 0.1 * np.arange(1, n_freqs + 1, dtype=np.float64)
     octaves = np.arange(10)
-    response = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
+    response = _turned(rng)
     course = np.log2(frequency / frequency[0])
     varying = np.array(
         [np.interp(course, octaves, 0.2 * rng.standard_normal(10)) for _ in range(18)]
@@ -112,14 +121,7 @@ def test_motion_that_a_third_of_an_octave_resolves_is_not_looked_for_with_others
     motion = np.sqrt(21 / 2) * _complex(rng, (n_freqs, n, 3))
     x = np.einsum("fpq,fnq->fnp", response, motion)
     x += np.sqrt(noise / 2) * _complex(rng, (n_freqs, n, 9))
-    found = self_noise(
-        "maximum-likelihood",
-        np.einsum("fnp,fnq->fpq", x, x.conj()) / n,
-        dims=(3, 3, 3),
-        n_effective=float(n),
-        blocks=blocks_of(frequency),
-    )
-    held = band_levels(found.noise_psd, found.cumulants, np.array([10, 398]), np.ones(1))
+    held = _levels(_averaged(x), n, (10, 398), blocks_of(frequency))
     low, high = held.interval()
     assert ((low[0] <= noise) & (noise <= high[0])).mean() > 0.7
     assert np.median(held.mean[0] / noise) < 1.5
@@ -128,21 +130,12 @@ def test_motion_that_a_third_of_an_octave_resolves_is_not_looked_for_with_others
 def test_directions_of_motion_near_the_noise_take_more_of_it() -> None:
     """A mean of ten bands was too low by 0.76 standard deviations."""
     rng = np.random.default_rng(54)
-    n, n_freqs, d, n_sensors = 200, 400, 3, 4
+    n, n_freqs = 200, 400
     z = []
     for _ in range(8):
-        turned = [np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(n_sensors)]
-        A = np.concatenate(turned) * np.sqrt([1.0, 1.4, 0.7])
+        A = _turned(rng, 4) * np.sqrt([1.0, 1.4, 0.7])
         drawn = averaged(np.broadcast_to(A @ A.T + np.eye(12), (n_freqs, 12, 12)), n, rng)
-        found = self_noise(
-            "maximum-likelihood",
-            drawn,
-            dims=(d,) * n_sensors,
-            n_effective=float(n),
-            blocks=np.arange(n_freqs) // 40,
-        )
-        whole = np.array([0, n_freqs])
-        held = band_levels(found.noise_psd, found.cumulants, whole, np.ones(1))
+        held = _levels(drawn, n, (0, n_freqs), np.arange(n_freqs) // 40)
         z.append((held.mean[0] - 1) / held.spread[0])
     assert abs(np.mean(z)) < 0.35
 
@@ -152,7 +145,7 @@ def test_an_axis_that_is_dead_in_all_sensors_feels_no_dimension_of_the_motion() 
     rng = np.random.default_rng(55)
     n = 40
     x = _complex(rng, (60, n, 12)) + 0.5 * np.tile(_complex(rng, (60, n, 3)), 4)
-    csm = np.einsum("fnp,fnq->fpq", x, x.conj()) / n
+    csm = _averaged(x)
     live = np.arange(12) % 3 < 2
     csm[:, ~live] = csm[:, :, ~live] = 0
     blocks = blocks_of(np.linspace(0.1, 6.0, 60))

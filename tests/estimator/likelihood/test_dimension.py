@@ -23,6 +23,20 @@ ITEM_9_SNR = 400.0
 """Of each horizontal: the mean over all triads then has the biases that item 9 gives."""
 
 
+def chosen(
+    csm: np.ndarray, frequency: np.ndarray, n: int, n_bands: int = 1
+) -> tuple[np.ndarray, tuple[BandDimension, ...]]:
+    """Choose the dimensions of triaxial sensors in bands of as many independent frequencies."""
+    return choose_dimension(
+        csm,
+        frequency,
+        dims=(3,) * (csm.shape[1] // 3),
+        n_effective=n,
+        band=np.arange(len(frequency)) * n_bands // len(frequency),
+        neighbours=INDEPENDENT,
+    )
+
+
 def mean_over_triads(csm: np.ndarray) -> np.ndarray:
     """Three-sensor estimate of five triaxial sensors, all pairs of a sensor weighing the same."""
     total = np.zeros(csm.shape[:2])
@@ -41,9 +55,7 @@ def test_incoherent_motion_is_explained_by_more_dimensions() -> None:
     band = np.repeat(np.arange(len(centres)), 24)
     csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR)
     averages = wishart(csm, 1080, np.random.default_rng(1))[0]
-    n_factors, choices = choose_dimension(
-        averages, frequency, dims=FIVE, n_effective=1080, band=band, neighbours=INDEPENDENT
-    )
+    n_factors, choices = chosen(averages, frequency, 1080, n_bands=len(centres))
     found = maximum_likelihood(averages, dims=FIVE, n_effective=1080, n_factors=n_factors)
     plain = mean_over_triads(averages)
     weighted = three_sensor(averages, dims=FIVE, n_effective=1080).noise_psd
@@ -79,14 +91,7 @@ def test_unequal_sensors_keep_the_ratios_of_their_noise() -> None:
     frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 20 * np.linspace(0.95, 1.05, 40)])
     csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
     averages = wishart(csm, 1080, np.random.default_rng(7))[0]
-    n_factors, (_, above) = choose_dimension(
-        averages,
-        frequency,
-        dims=FIVE,
-        n_effective=1080,
-        band=np.repeat([0, 1], 40),
-        neighbours=INDEPENDENT,
-    )
+    n_factors, (_, above) = chosen(averages, frequency, 1080, n_bands=2)
     assert above.n_factors == 9
     found = maximum_likelihood(averages, dims=FIVE, n_effective=1080, n_factors=n_factors)
     ratio = found.noise_psd[40:] / noise_psd
@@ -101,14 +106,8 @@ def test_known_ratios_of_noise_require_fewer_factors() -> None:
     noise_psd = np.repeat([1, 0.2, 5, 1, 20.0], 3)
     frequency = np.concatenate([np.linspace(0.95, 1.05, 40), 10 * np.linspace(0.95, 1.05, 40)])
     csm = plane_waves(frequency, pentagon(), snr=ITEM_9_SNR) + np.diag(noise_psd - 1)
-    _, choices = choose_dimension(
-        wishart(csm, 1080, np.random.default_rng(3))[0],
-        frequency,
-        dims=FIVE,
-        n_effective=1080,
-        band=np.repeat([0, 1], 40),
-        neighbours=INDEPENDENT,
-    )
+    averages = wishart(csm, 1080, np.random.default_rng(3))[0]
+    _, choices = chosen(averages, frequency, 1080, n_bands=2)
     assert choices[0].n_factors == 3
     assert 7 <= choices[1].n_factors <= 9
 
@@ -129,9 +128,7 @@ def test_ratios_come_from_the_nearest_frequencies() -> None:
 def test_three_sensors_cannot_fit_further_dimensions_and_are_flagged() -> None:
     frequency = np.linspace(18, 22, 20)
     csm = wishart(plane_waves(frequency, pentagon()[:3]), 1080, np.random.default_rng(2))[0]
-    n_factors, (choice,) = choose_dimension(
-        csm, frequency, dims=THREE, n_effective=1080, band=np.zeros(20, np.int64)
-    )
+    n_factors, (choice,) = chosen(csm, frequency, 1080)
     assert not choice.accepted
     assert np.all(n_factors == choice.n_factors)
     assert choice.is_biased
@@ -141,9 +138,7 @@ def test_four_sensors_fit_further_dimensions_but_remain_undetermined() -> None:
     """The test does not reject the model, and the noise is far from true."""
     frequency = np.linspace(18, 22, 20)
     csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
-    n_factors, (choice,) = choose_dimension(
-        csm, frequency, dims=(3,) * 4, n_effective=1080, band=np.zeros(20, np.int64)
-    )
+    n_factors, (choice,) = chosen(csm, frequency, 1080)
     assert choice.n_factors > choice.usual
     assert choice.is_undetermined
     assert not choice.accepted
@@ -156,15 +151,7 @@ def test_motion_of_too_many_dimensions_is_said_to_bias_the_noise() -> None:
     rng = np.random.default_rng(5)
     loadings = rng.standard_normal((15, 11))
     csm = np.tile((100 * loadings @ loadings.T + np.eye(15)).astype(complex), (8, 1, 1))
-    averages = wishart(csm, 450, rng)[0]
-    _, (choice,) = choose_dimension(
-        averages,
-        np.arange(1.0, 9.0),
-        dims=FIVE,
-        n_effective=450,
-        band=np.zeros(8, np.int64),
-        neighbours=INDEPENDENT,
-    )
+    _, (choice,) = chosen(wishart(csm, 450, rng)[0], np.arange(1.0, 9.0), 450)
     assert choice.n_factors == 10
     assert choice.is_biased
 
@@ -175,20 +162,16 @@ def test_a_missing_dimension_is_excluded_and_improves_precision() -> None:
     directions = np.concatenate([rotation(rng, 3) for _ in range(3)])[:, :2]
     csm = directions @ np.diag([100.0, 150.0]) @ directions.T + np.eye(9)
     averages = wishart(csm.astype(np.complex128), 1080, rng, n_draws=200)
-    frequency = np.linspace(1, 2, 200)
-    whole = np.zeros(200, np.int64)
-    n_factors, (choice,) = choose_dimension(
-        averages, frequency, dims=THREE, n_effective=1080, band=whole, neighbours=INDEPENDENT
-    )
+    n_factors, (choice,) = chosen(averages, np.linspace(1, 2, 200), 1080)
     assert choice.n_factors == 2
     assert (choice.usual, choice.accepted, choice.is_biased) == (3, True, False)
-    chosen = maximum_likelihood(averages, dims=THREE, n_effective=1080, n_factors=n_factors)
+    found = maximum_likelihood(averages, dims=THREE, n_effective=1080, n_factors=n_factors)
     usual = maximum_likelihood(averages, dims=THREE, n_effective=1080)
-    scatter = chosen.noise_psd.std(axis=0).mean()
+    scatter = found.noise_psd.std(axis=0).mean()
     assert scatter < 0.8 * usual.noise_psd.std(axis=0).mean()
     # of noise that is known to be independent; matrices of the sensors cost a tenth
     assert scatter == pytest.approx(choice.cov, rel=0.15)
-    assert chosen.noise_psd.mean() == pytest.approx(1, abs=0.005)
+    assert found.noise_psd.mean() == pytest.approx(1, abs=0.005)
 
 
 @pytest.mark.parametrize("snr", [0.0, 1.0, 1e4])
@@ -197,9 +180,7 @@ def test_the_full_motion_keeps_its_dimension(snr: float) -> None:
     rng = np.random.default_rng(4)
     csm = random_bench(rng, dims=THREE, snr=snr, noise_psd=np.ones(9))
     averages = wishart(csm, 500, rng, n_draws=60)
-    _, choices = choose_dimension(
-        averages, np.linspace(1, 1.2, 60), dims=THREE, n_effective=500, neighbours=INDEPENDENT
-    )
+    _, choices = chosen(averages, np.linspace(1, 1.2, 60), 500)
     assert [choice.n_factors for choice in choices] == [3 if snr else 0]
     assert choices[0].accepted
 
@@ -210,9 +191,7 @@ def test_a_singular_frequency_does_not_affect_its_band() -> None:
         random_bench(rng, dims=THREE, snr=1e3, noise_psd=np.ones(9)), 500, rng, n_draws=20
     )
     averages[3] = averages[3, :, :1] @ averages[3, :1, :] / averages[3, 0, 0]
-    _, (choice,) = choose_dimension(
-        averages, np.linspace(1, 1.2, 20), dims=THREE, n_effective=500, neighbours=INDEPENDENT
-    )
+    _, (choice,) = chosen(averages, np.linspace(1, 1.2, 20), 500)
     assert choice.n_factors == 3
     assert choice.test.n_frequencies == 19
 
@@ -222,7 +201,7 @@ def test_one_average_says_that_there_are_too_few() -> None:
     one = np.random.default_rng(3).standard_normal((20, 9)).astype(np.complex128)
     csm = one[:, :, np.newaxis] * one[:, np.newaxis]
     with pytest.raises(InsufficientDataError, match=r"1\.0 averages of 9 channels"):
-        choose_dimension(csm, np.linspace(1, 2, 20), dims=THREE, n_effective=1)
+        chosen(csm, np.linspace(1, 2, 20), 1)
 
 
 def test_a_dead_sensor_does_not_count() -> None:
@@ -231,17 +210,14 @@ def test_a_dead_sensor_does_not_count() -> None:
     csm = wishart(plane_waves(frequency, pentagon()[:4]), 1080, np.random.default_rng(2))[0]
     three = csm[:, :9, :9].copy()
     csm[:, 9:, :] = csm[:, :, 9:] = 0
-    band = np.zeros(20, np.int64)
-    with_dead, (choice,) = choose_dimension(
-        csm, frequency, dims=(3,) * 4, n_effective=1080, band=band
-    )
-    without, (same,) = choose_dimension(three, frequency, dims=THREE, n_effective=1080, band=band)
+    with_dead, (choice,) = chosen(csm, frequency, 1080)
+    without, (same,) = chosen(three, frequency, 1080)
     np.testing.assert_array_equal(with_dead, without)
     assert choice.test.degrees == same.test.degrees
     assert choice.test.statistic == pytest.approx(same.test.statistic, rel=1e-6)
     csm[:, 6:, :] = csm[:, :, 6:] = 0
     with pytest.raises(InsufficientDataError, match="2 sensors have a signal of their own"):
-        choose_dimension(csm, frequency, dims=(3,) * 4, n_effective=1080)
+        chosen(csm, frequency, 1080)
 
 
 def test_channels_keep_their_kind_if_one_is_dead() -> None:
@@ -254,9 +230,7 @@ def test_channels_keep_their_kind_if_one_is_dead() -> None:
     averages[:, 0] = averages[:, :, 0] = 0
     found = []
     for unit in (1.0, 1e-10):  # the one in which a dead channel's stand-in has noise of one, or not
-        n_factors, (_, choice) = choose_dimension(
-            averages * unit, frequency, dims=FIVE, n_effective=60, band=band
-        )
+        n_factors, (_, choice) = chosen(averages * unit, frequency, 60, n_bands=2)
         result = maximum_likelihood(averages * unit, dims=FIVE, n_effective=60, n_factors=n_factors)
         assert choice.n_factors > 3
         found.append(np.append(result.noise_psd[band == 1][:, 1:].mean(axis=0) / unit, choice.cov))
@@ -322,14 +296,7 @@ def test_the_ratio_with_a_matrix_for_each_sensor_is_chi_squared(snr: float) -> N
 def test_what_a_sensor_s_channels_share_is_no_dimension_of_the_motion(n_sensors: int) -> None:
     rng = np.random.default_rng(n_sensors)
     csm = np.broadcast_to(_sharing(10.0, n_sensors, rng), (24, 3 * n_sensors, 3 * n_sensors))
-    n_factors, (choice,) = choose_dimension(
-        wishart(csm, 189, rng)[0],
-        np.linspace(1.0, 1.2, 24),
-        dims=(3,) * n_sensors,
-        n_effective=189,
-        neighbours=INDEPENDENT,
-        band=np.zeros(24, np.int64),
-    )
+    n_factors, (choice,) = chosen(wishart(csm, 189, rng)[0], np.linspace(1.0, 1.2, 24), 189)
     assert choice.accepted
     assert n_factors.tolist() == [3] * 24
     assert choice.tried[2].p_value < 1e-6  # nor is it less
@@ -340,17 +307,9 @@ def test_a_level_for_all_bands_together() -> None:
     rng, rejected = np.random.default_rng(12), 0
     axes = np.concatenate([rotation(rng, 3) for _ in range(4)])
     csm = (10.0 * axes @ axes.T + np.eye(12)).astype(np.complex128)
-    band = np.repeat(np.arange(10), 8)
     for _ in range(6):
         sample = wishart(np.broadcast_to(csm, (80, 12, 12)), 100, rng)[0]
-        _, choices = choose_dimension(
-            sample,
-            np.geomspace(1.0, 10.0, 80),
-            dims=(3,) * 4,
-            n_effective=100,
-            neighbours=INDEPENDENT,
-            band=band,
-        )
+        _, choices = chosen(sample, np.geomspace(1.0, 10.0, 80), 100, n_bands=10)
         rejected += not all(choice.accepted for choice in choices)
     assert rejected <= 1
 
