@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -38,6 +39,11 @@ def in_an_octave(gain: float) -> Filter:
     return lambda samples: samples + gain * signal.sosfiltfilt(sections, samples, axis=0)
 
 
+RISES = in_an_octave(0.0), in_an_octave(0.02)
+"""Gain of an octave, before and after."""
+
+
+@functools.cache  # two tests look at one bench
 def estimated(
     seed: int, before: Filter, after: Filter, *, ratio: float = 1e6, octaves: bool = False
 ) -> Snapshot:
@@ -71,10 +77,10 @@ def test_what_leaks_is_in_the_interval_from_the_first_line_on() -> None:
     [
         (high_pass(0.8), high_pass(1.0), 1e4),
         (resonant(8.0), resonant(8.2), 1e6),
-        (in_an_octave(0.0), in_an_octave(0.02), 1e4),
+        (*RISES, 1e4),
         pytest.param(high_pass(0.8), high_pass(1.0), 1e6, marks=pytest.mark.long),
         pytest.param(resonant(8.0), resonant(8.2), 1e4, marks=pytest.mark.long),
-        pytest.param(in_an_octave(0.0), in_an_octave(0.02), 1e6, marks=pytest.mark.long),
+        pytest.param(*RISES, 1e6, marks=pytest.mark.long),
     ],
 )
 def test_a_response_that_changes_at_some_frequencies_is_named_and_held(
@@ -88,13 +94,13 @@ def test_a_response_that_changes_at_some_frequencies_is_named_and_held(
 
 
 def test_a_gain_that_changes_in_one_octave_is_held_with_octaves() -> None:
-    snapshot = estimated(3, in_an_octave(0.0), in_an_octave(0.02), octaves=True)
+    snapshot = estimated(3, *RISES, octaves=True)
     assert held(snapshot).mean() > 0.93
 
 
 def test_what_clocks_explain_is_no_change_of_a_response() -> None:
     """Beside times that nobody could check, a gain that rose by 240 % was named."""
-    snapshot = estimated(2, in_an_octave(0.0), in_an_octave(0.02), ratio=1e4)
+    snapshot = estimated(2, *RISES, ratio=1e4)
     found = Findings(diagnosis=snapshot.diagnostics.diagnosis)
     assert found.beside_clocks(snapshot.clocks) == found
     unchecked = [replace(clock, unchecked=True) for clock in snapshot.clocks]

@@ -45,7 +45,7 @@ def test_intervals_cover_the_mean_noise(case: str, sensor: int, covered: float) 
     """Intervals of steady noise cover 89 % after the step, 43 % with the burst, 83 % in gusts."""
     rng = np.random.default_rng(2)
     hits = []
-    for _ in range(3):
+    for _ in range(2):
         motion = 30 * rng.standard_normal((N, 3))
         samples, truth = {}, []
         for name in "ABC":

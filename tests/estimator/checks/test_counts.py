@@ -9,7 +9,7 @@ import pytest
 
 from estimator.checks.counts import before_rounding, covariance, shared_rounding
 
-N_SAMPLES, LENGTH = 1 << 18, 512
+N_SAMPLES, LENGTH = 1 << 17, 512
 
 
 def _segments(samples: np.ndarray) -> np.ndarray:

@@ -242,7 +242,7 @@ def test_the_estimate_is_unbiased_with_the_scatter_of_the_bound(
     A sample c.o.v. of m draws scatters by 1/sqrt(2 m) (more for the skewed: 1.5 allows it),
     the mean by cov/sqrt(m), coverage by sqrt(.05 .95/m).
     """
-    n_draws = 300 if n_averages == 100 else 600
+    n_draws = 200 if n_averages == 100 else 600
     csm, noise_psd, dims = GEOMETRIES[geometry]
     bound = fisher.cramer_rao_cov(csm[None], noise_psd[None], n_effective=n_averages, dims=dims)[0]
     draws = wishart(csm, n_averages, np.random.default_rng(n_averages), n_draws=n_draws)
@@ -295,7 +295,7 @@ def test_the_estimate_is_unbiased_from_twenty_averages_on(d: int, snr: float) ->
     [1e-1, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1e6, marks=pytest.mark.long)],
 )
 def test_bias_under_one_percent_at_any_snr(d: int, snr: float) -> None:
-    n_draws = 1000
+    n_draws = 600
     csm = equal_noise(18, dims=(d,) * 3, snr=snr)
     draws = wishart(csm, 1080, np.random.default_rng(19), n_draws=n_draws)
     found = maximum_likelihood(draws, dims=(d,) * 3, n_effective=1080)
@@ -314,7 +314,7 @@ def test_unresolved_motion_causes_a_bias_of_a_few_percent(
     dims: tuple[int, ...], snr: float
 ) -> None:
     """No estimate is unbiased there (decision 10); factors fitted to scatter cost 16 to 23 %."""
-    n_draws = 600 if sum(dims) == 3 else 200
+    n_draws = 400 if sum(dims) == 3 else 150
     draws = wishart(
         equal_noise(18, dims=dims, snr=snr), 20, np.random.default_rng(27), n_draws=n_draws
     )
