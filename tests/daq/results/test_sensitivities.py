@@ -39,11 +39,11 @@ def held(method: str, seed: int) -> tuple[list[bool], list[bool]]:
 
 @pytest.mark.parametrize("method", ["two-channel", "three-channel", "three-sensor"])
 def test_intervals_hold_the_truth_with_sensitivities_off_as_stated(method: str) -> None:
-    """Of 36 intervals 34 should; 30 leaves room for chance (p = 0.01)."""
-    draws = [held(method, seed) for seed in range(12)]
+    """Of 24 intervals 23 should; 20 leaves room for chance (p = 0.01)."""
+    draws = [held(method, seed) for seed in range(8)]
     exact, stated = (np.array([draw[n] for draw in draws]) for n in (0, 1))
-    assert stated.sum() >= 30, stated.mean()
-    assert exact.sum() < 27, exact.mean()  # scatter alone is too narrow
+    assert stated.sum() >= 20, stated.mean()
+    assert exact.sum() < 18, exact.mean()  # scatter alone is too narrow
 
 
 def test_temperatures_and_certificates_are_in_the_interval() -> None:

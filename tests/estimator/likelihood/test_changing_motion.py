@@ -167,7 +167,7 @@ def test_gains_that_follow_the_loudness_are_inside_the_interval_or_seen() -> Non
             inside.append(holds(found, bench)[found.identified])
         assert np.concatenate(inside).mean() > 0.93
     seen = []
-    for bench in benches(13, d=3, snr=1000):
+    for bench in benches(13, draws=24, d=3, snr=1000):
         level = changing(bench)
         found = bench.estimate(bench.parts(level, gain=1 + 0.01 * level / 10))
         seen.append(np.abs(found.follows[0]).max() > 3.5)
