@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,13 +101,37 @@ def create(
     return RecordingWriter.create(path, sensors=layouts, created=created, attributes=attributes)
 
 
-def write(path: Path, sensors: dict[str, Sensor]) -> Path:
-    """Write and close a recording."""
+def arriving(sensors: dict[str, Sensor]) -> list[Block]:
+    """Return the blocks of all sensors as they arrive."""
+    found = (block for name, sensor in sensors.items() for block in blocks(name, sensor))
+    return sorted(found, key=lambda block: block.received.monotonic_ns)
+
+
+def later(at: HostTime, ns: int) -> HostTime:
+    """Return an instant so many ns later."""
+    return HostTime(at.monotonic_ns + ns, at.utc_ns + ns)
+
+
+def written(
+    path: Path,
+    sensors: dict[str, Sensor],
+    change: Callable[[Block], Block] = lambda block: block,
+) -> RecordingWriter:
+    """Return a writer with all blocks of these sensors, changed; it is to be closed."""
     writer = create(path, sensors)
     for name, sensor in sensors.items():
         for block in blocks(name, sensor):
-            writer.append(block)
-    writer.close()
+            writer.append(change(block))
+    return writer
+
+
+def write(
+    path: Path,
+    sensors: dict[str, Sensor],
+    change: Callable[[Block], Block] = lambda block: block,
+) -> Path:
+    """Write and close a recording, of changed blocks."""
+    written(path, sensors, change).close()
     return path
 
 

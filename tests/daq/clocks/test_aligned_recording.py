@@ -12,9 +12,18 @@ from numpy.typing import NDArray
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.resampling import reach
 from daq.errors import CannotAlignError
-from daq.protocols.block import HostTime
+from daq.protocols.block import Block
 from daq.recording.reader import Recording
-from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
+from tests.daq.clocks.recordings import (
+    ORIGIN,
+    Sensor,
+    blocks,
+    counts,
+    create,
+    later,
+    write,
+    written,
+)
 
 
 def test_samples_of_one_clock_are_bit_exact_for_any_division_of_reads(tmp_path: Path) -> None:
@@ -79,10 +88,7 @@ def test_two_sensors_and_free_clocks_have_the_common_span_which_is_shorter(
 
 def test_a_growing_recording_waits_for_samples_of_all_sensors(tmp_path: Path) -> None:
     sensors = with_one_apart("abcd", utc=True)
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            writer.append(block)
+    writer = written(tmp_path / "r.h5", sensors)
     writer.commit()
     with Recording.open(tmp_path / "r.h5") as recording:
         aligned = AlignedRecording(recording)
@@ -159,15 +165,14 @@ def test_unequal_rates_are_resampled_to_the_lowest_without_aliases(tmp_path: Pat
 def test_a_restart_begins_a_new_clock_epoch(tmp_path: Path) -> None:
     first = Sensor(counts(3000, 1, 1), clock="a")
     other = Sensor(counts(3000, 1, 2), clock="b", restarts=(1500,))
-    writer = create(tmp_path / "r.h5", {"a": first, "b": other})
-    for block in blocks("a", first):
-        writer.append(block)
-    for block in blocks("b", other):
-        late = 3_700_000 if block.first_sample >= 1500 else 0  # restarted 0.37 samples later
-        at = type(block.received)(block.received.monotonic_ns + late, block.received.utc_ns + late)
-        writer.append(type(block)("b", block.first_sample, block.counts, at, flags=block.flags))
-    writer.close()
-    with Recording.open(tmp_path / "r.h5") as recording:
+
+    def restarted(block: Block) -> Block:
+        """Return it 0.37 samples later."""
+        late = 3_700_000 if block.sensor == "b" and block.first_sample >= 1500 else 0
+        return replace(block, received=later(block.received, late))
+
+    path = write(tmp_path / "r.h5", {"a": first, "b": other}, restarted)
+    with Recording.open(path) as recording:
         aligned = AlignedRecording(recording)
         assert [state.n_epochs for state in aligned.clocks] == [1, 2]
         delays = aligned.delays(np.array([500.0, 2500.0]))
@@ -245,7 +250,7 @@ def test_clocks_are_aligned_after_an_hour_of_suspension(tmp_path: Path) -> None:
             # It counts on; the host has slept for all of the hour.
             arrival = start + (block.end_sample + lost - 1) / rate - hour + sensor.late
             shift = round(arrival * 1e9) + ORIGIN.monotonic_ns - block.received.monotonic_ns
-            at = HostTime(block.received.monotonic_ns + shift, block.received.utc_ns + shift)
+            at = later(block.received, shift)
             found.append(replace(block, first_sample=block.first_sample + lost, received=at))
     writer = create(tmp_path / "r.h5", writer_of)
     for block in found:

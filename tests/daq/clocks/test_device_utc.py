@@ -13,6 +13,7 @@ from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.device_utc import corrected, from_device_utc
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.protocols.block import Block
 from daq.recording.reader import Recording
 from sim_devices.world.scenario import Scenario
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
@@ -71,15 +72,14 @@ def test_a_correction_of_device_utc_moves_no_samples(tmp_path: Path, ahead: int)
         "a": Sensor(counts(6000, 1, 1)),
         "b": Sensor(counts(6000, 1, 2), utc=True, late=0.5, restarts=(500,)),
     }
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            stated = block.device_counter
-            if stated is not None and block.first_sample < 500:
-                stated += ahead * 10**9
-            writer.append(replace(block, device_counter=stated))
-    writer.close()
-    with Recording.open(tmp_path / "r.h5") as recording:
+
+    def corrected(block: Block) -> Block:
+        stated = block.device_counter
+        if stated is not None and block.first_sample < 500:
+            stated += ahead * 10**9
+        return replace(block, device_counter=stated)
+
+    with Recording.open(write(tmp_path / "r.h5", sensors, corrected)) as recording:
         aligned = AlignedRecording(recording)
         at = (4000.0 + ORIGIN.utc_ns * 1e-7 - aligned.start_utc_ns * 1e-7) * np.ones(1)
         assert np.ptp(aligned.delays(at)) < 1e-3

@@ -20,14 +20,14 @@ from daq.errors import CannotAlignError
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
-from daq.protocols.block import BlockFlag, DeviceItem, HostTime
+from daq.protocols.block import Block, BlockFlag, DeviceItem, HostTime
 from daq.recorder.block_writer import BlockWriter
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
 from daq.recording.writer import RecordingWriter
 from daq.results.facts.clocks import ClockSet
 from daq.results.result import Result
-from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
+from tests.daq.clocks.recordings import ORIGIN, Sensor, later, write
 from tests.peers.digitizer import CODES, START, Digitizer, seedlink
 from tests.peers.text_logger import CHANNELS as TEXT_CHANNELS
 from tests.peers.text_logger import TextLogger
@@ -133,17 +133,12 @@ def lossy(path: Path, *, rate: float = float(RATE), lost: int = 0) -> None:
     made = {}
     for name, samples in zip("ABC", counts(3, 30_000), strict=True):
         made[name] = Sensor(samples, rate=rate if name == "B" else RATE, nominal=RATE)
-    writer = create(path, made)
-    for name, sensor in made.items():
-        for block in blocks(name, sensor):
-            late = lost / RATE if name == "B" and block.first_sample > 20_000 else 0.0
-            at = HostTime(
-                block.received.monotonic_ns + round(late * 1e9),
-                block.received.utc_ns + round(late * 1e9),
-            )
-            object.__setattr__(block, "received", at)
-            writer.append(block)
-    writer.close()
+
+    def late(block: Block) -> Block:
+        is_late = block.sensor == "B" and block.first_sample > 20_000
+        return replace(block, received=later(block.received, is_late * round(lost / RATE * 1e9)))
+
+    write(path, made, late)
 
 
 def test_a_span_before_a_loss_is_estimated_by_its_own_rate(tmp_path: Path) -> None:
@@ -188,32 +183,26 @@ def stating(path: Path, faults: dict[str, tuple[str, float]], *, seconds: float 
         lost = round(size * RATE) if kind == "loss" else 0
         gone = slice(middle, middle + lost)
         made[name] = Sensor(np.delete(samples, gone, axis=0), utc=True, restarts=(middle,))
-    writer = create(path, made)
-    for name, sensor in made.items():
-        kind, size = faults.get(name, ("", 0.0))
-        for block in blocks(name, sensor):
-            first, late, flags = block.first_sample, 0, block.flags
-            if first >= middle:
-                flags &= ~BlockFlag.CLOCK_RESTART
-                late = round(size * 1e9)
-            ahead = late if kind == "gap" else 0
-            if ahead and first == middle:
-                flags |= BlockFlag.MISSING_ESTIMATED
-            came = late - ahead
-            assert block.device_counter is not None
-            writer.append(
-                replace(
-                    block,
-                    first_sample=first + round(ahead * RATE / 1e9),
-                    flags=flags,
-                    device_counter=block.device_counter + ahead,
-                    received=HostTime(
-                        block.received.monotonic_ns + came, block.received.utc_ns + came
-                    ),
-                )
-            )
-    writer.close()
-    return path
+
+    def wrong(block: Block) -> Block:
+        kind, size = faults.get(block.sensor, ("", 0.0))
+        first, late, flags = block.first_sample, 0, block.flags
+        if first >= middle:
+            flags &= ~BlockFlag.CLOCK_RESTART
+            late = round(size * 1e9)
+        ahead = late if kind == "gap" else 0
+        if ahead and first == middle:
+            flags |= BlockFlag.MISSING_ESTIMATED
+        assert block.device_counter is not None
+        return replace(
+            block,
+            first_sample=first + round(ahead * RATE / 1e9),
+            flags=flags,
+            device_counter=block.device_counter + ahead,
+            received=later(block.received, late - ahead),
+        )
+
+    return write(path, made, wrong)
 
 
 @pytest.mark.parametrize(

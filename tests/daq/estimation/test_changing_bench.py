@@ -62,6 +62,17 @@ def estimated(
     ).snapshot
 
 
+def held(snapshot: Snapshot, columns: slice = slice(None)) -> float:
+    """Return the share of intervals of single frequencies that hold the expected noise."""
+    noise = snapshot.results["three-sensor"]
+    low, high = noise.low[5:45, columns], noise.high[5:45, columns]
+    return float(np.mean((low <= NOISE) & (high >= NOISE)))
+
+
+def changes(snapshot: Snapshot) -> list[ResponseChanges]:
+    return [each for each in snapshot.diagnostics.advice if isinstance(each, ResponseChanges)]
+
+
 @pytest.mark.parametrize(
     ("kind", "size", "words"),
     [
@@ -74,21 +85,15 @@ def test_a_response_that_changes_is_named_sized_and_dated(
     kind: str, size: float, words: tuple[str, ...]
 ) -> None:
     snapshot = estimated(kind, 1, ratio=1e6)
-    found = snapshot.diagnostics.advice
-    (change,) = [each for each in found if isinstance(each, ResponseChanges)]
+    (change,) = changes(snapshot)
     text = change.words(replace(snapshot.names, start_utc_ns=0)).line
     for each in words:
         assert each in text
     assert change.size == pytest.approx(size, rel=0.05)
     if kind != "ramp":
         assert change.begin == change.end == pytest.approx(480, abs=50 / 4)  # a quarter of a part
-    assert not any(isinstance(each, NoiseChanges) for each in found)
-    # The interval holds the expected noise, of which the estimate is far off.
-    noise = snapshot.results["three-sensor"]
-    inside = slice(5, 45)
-    own = slice(3, 6)
-    low, high = noise.low[inside, own], noise.high[inside, own]
-    assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
+    assert not any(isinstance(each, NoiseChanges) for each in snapshot.diagnostics.advice)
+    assert held(snapshot, slice(3, 6)) > 0.93  # of which the estimate is far off
 
 
 @pytest.mark.parametrize(("kind", "most"), [("step", 1.0), ("ramp", 2.5), ("settles", 1.0)])
@@ -97,9 +102,7 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     snapshot = estimated(kind, 1, ratio=1e6)
     found = Result(snapshot, Settings()).spectrum("three-sensor").levels(np.array([5, 15, 30, 45]))
     assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
-    noise = snapshot.results["three-sensor"]
-    inside = slice(5, 45)
-    assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
+    assert held(snapshot) > 0.93
     assert snapshot.n_effective < 420  # of 455: every part has spent three
 
 
@@ -124,12 +127,10 @@ def test_of_few_averages_a_change_is_named_and_opens_the_interval(*, octaves: bo
 def test_a_gain_that_changes_from_segment_to_segment_bounds_its_noise(ratio: float) -> None:
     """Parts of time do not show it: noise of B was 7 and 26 dB too high in silence."""
     snapshot = estimated("jitter", 1, ratio=ratio)
-    (change,) = [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
+    (change,) = changes(snapshot)
     assert change.sensors == (1,)
     assert 0.01 < change.size < 0.02  # of segments of 5 s, weighted by the window
-    noise, inside = snapshot.results["three-sensor"], slice(5, 45)
-    low, high = noise.low[inside], noise.high[inside]
-    assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
+    assert held(snapshot) > 0.93
 
 
 def test_an_estimate_that_still_grows_holds_what_a_step_adds() -> None:
@@ -138,18 +139,16 @@ def test_an_estimate_that_still_grows_holds_what_a_step_adds() -> None:
     with Estimation([recording], Settings(segment=5.0)) as live:
         while live.update():
             pass
-        noise = live.snapshot().results["three-sensor"]
-    inside = slice(5, 45)
-    low, high = noise.low[inside], noise.high[inside]
-    assert np.mean((low <= NOISE) & (high >= NOISE)) > 0.93
-    assert np.mean(low[:, 3] <= 0) > 0.93
+        snapshot = live.snapshot()
+    assert held(snapshot) > 0.93
+    assert np.mean(snapshot.results["three-sensor"].low[5:45, 3] <= 0) > 0.93
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("option", ["octaves", "reject"])
 def test_changes_are_found_with_every_option(option: str) -> None:
     snapshot = estimated("step", 4, ratio=1e6, option=option)
-    (change,) = [e for e in snapshot.diagnostics.advice if isinstance(e, ResponseChanges)]
+    (change,) = changes(snapshot)
     assert change.channel == 3
     assert change.size == pytest.approx(-0.05, rel=0.1)
     noise = snapshot.results["three-sensor"]
@@ -167,10 +166,8 @@ def test_gains_that_follow_one_temperature_bound_bands_without_a_noise_that_is_k
 def test_gains_that_follow_one_temperature_are_found() -> None:
     """Motion in which all sensors differ hides the noise of one: it seems to be zero."""
     snapshot = estimated("temperature", 2)
-    found = snapshot.diagnostics.advice
-    assert any(isinstance(each, ResponseChanges) for each in found)
-    noise, inside = snapshot.results["three-sensor"], slice(5, 45)
-    assert np.mean((noise.low[inside] <= NOISE) & (noise.high[inside] >= NOISE)) > 0.93
+    assert changes(snapshot)
+    assert held(snapshot) > 0.93
 
 
 @pytest.mark.parametrize(
@@ -195,8 +192,7 @@ def test_bursts_of_motion_among_weaker_motion_than_noise_are_no_change() -> None
             name: motion + own * rng.standard_normal((N, 1))
             for name, own in zip("ABC", (1.0, 0.5, 2.0), strict=True)
         }
-        found = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
-        assert not [e for e in found.diagnostics.advice if isinstance(e, ResponseChanges)]
+        assert not changes(huddle.self_noise(samples, fs=RATE, segment="5s").snapshot)
 
 
 def test_steady_noise_of_more_than_4096_segments_scatters_as_all_of_them() -> None:

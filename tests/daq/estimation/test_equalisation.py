@@ -22,7 +22,7 @@ from estimator.methods import self_noise
 from estimator.self_noise.result import SelfNoise
 from sim_devices.world.scenario import Scenario
 from tests import known_clocks
-from tests.daq.clocks.recordings import Sensor, blocks, create, write
+from tests.daq.clocks.recordings import Sensor, arriving, create, write
 
 FloatArray = NDArray[np.float64]
 
@@ -138,12 +138,8 @@ def test_equalised_by_measured_responses_the_noise_is_the_true_one(
 ) -> None:
     path = tmp_path / "r.h5"
     writer = create(path, recorded())
-    arriving = sorted(
-        (block for name, sensor in recorded().items() for block in blocks(name, sensor)),
-        key=lambda block: block.received.monotonic_ns,
-    )
     with Estimation([path], replace(OFF, equalise="auto")) as live:
-        for number, block in enumerate(arriving):
+        for number, block in enumerate(arriving(recorded())):
             writer.append(block)
             if number % 800 == 799:
                 writer.commit()

@@ -18,7 +18,7 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.flatline import FlatlineDetector
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError, Snapshot
-from daq.protocols.block import BlockFlag
+from daq.protocols.block import Block, BlockFlag
 from daq.results.facts.channels import ChannelsStoodStill, ChannelsWrap, ReadingsRepeat
 from daq.results.result import Result
 from estimator.checks.advice import Rank, Untested
@@ -29,7 +29,7 @@ from estimator.levels.contributions import Source
 from estimator.methods import Flag, self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from tests.daq.clocks.recordings import Sensor, blocks, create, write
+from tests.daq.clocks.recordings import Sensor, arriving, create, write, written
 
 RATE = 100.0
 SETTINGS = Settings(segment=1.0)
@@ -65,12 +65,8 @@ def spectra_of(sensors: dict[str, Sensor], starts: list[int]) -> CrossSpectra:
 def followed(path: Path, sensors: dict[str, Sensor], settings: Settings) -> Snapshot:
     """Write a recording bit by bit while it is followed; return how that ends."""
     writer = create(path, sensors)
-    arriving = sorted(
-        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
-        key=lambda block: block.received.monotonic_ns,
-    )
     with Estimation([path], settings) as live:
-        for number, block in enumerate(arriving):
+        for number, block in enumerate(arriving(sensors)):
             writer.append(block)
             if number % 240 == 239:
                 writer.commit()
@@ -91,10 +87,7 @@ def test_what_is_wrong_is_said_within_a_minute_while_recording(tmp_path: Path) -
     sensors["b"].counts[:] = sensors["b"].counts[:, [1, 0, 2]]
     sensors["c"].counts[:, 2] = 0
     np.clip(sensors["d"].counts[:, 0], -15000, 15000, out=sensors["d"].counts[:, 0])
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            writer.append(block)
+    writer = written(tmp_path / "r.h5", sensors)
     writer.commit()
     with Estimation([tmp_path / "r.h5"], SETTINGS) as live:
         live.update()
@@ -189,16 +182,14 @@ def test_slow_motion_in_coarse_counts_is_not_interpolated() -> None:
 
 
 def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -> None:
+    def clipped(block: Block) -> Block:
+        if block.sensor != "b" or block.first_sample != 5000:  # samples 5000 to 5049
+            return block
+        counts = np.full_like(block.counts, 70_000)
+        return replace(block, flags=block.flags | BlockFlag.CLIPPED, counts=counts)
+
     sensors = bench()
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            clipped = name == "b" and block.first_sample == 5000  # samples 5000 to 5049
-            flags = block.flags | BlockFlag.CLIPPED if clipped else block.flags
-            counts = np.full_like(block.counts, 70_000) if clipped else block.counts
-            writer.append(replace(block, flags=flags, counts=counts))
-    writer.close()
-    found = estimate([tmp_path / "r.h5"], SETTINGS)
+    found = estimate([write(tmp_path / "r.h5", sensors, clipped)], SETTINGS)
     assert not found.diagnostics.counts.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5050]
     assert found.left_out == {"gap": 0, "clipped": 2, "transient": 0, "chosen": 0}
@@ -320,15 +311,11 @@ def test_while_live_the_dimension_is_chosen_anew_when_segments_have_doubled(
 ) -> None:
     sensors = bench()
     writer = create(tmp_path / "r.h5", sensors)
-    arriving = sorted(
-        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
-        key=lambda block: block.received.monotonic_ns,
-    )
     settings = replace(SETTINGS, methods=("maximum-likelihood",), dimension="auto")
     chosen_at: list[int] = []
     last, n_before = None, 0
     with Estimation([tmp_path / "r.h5"], settings) as live:
-        for number, block in enumerate(arriving[:480]):  # 80 s, 160 segments
+        for number, block in enumerate(arriving(sensors)[:480]):  # 80 s, 160 segments
             writer.append(block)
             if number % 30 == 29:
                 writer.commit()

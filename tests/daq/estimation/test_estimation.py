@@ -21,7 +21,7 @@ from estimator.errors import InsufficientDataError
 from estimator.methods import self_noise
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import CrossSpectra, WelchSettings
-from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, later, write
 
 SETTINGS = Settings(segment=1.0, methods=("three-sensor",))
 
@@ -95,25 +95,16 @@ def test_what_is_shown_live_at_the_end_is_the_estimate_from_the_file(
         sensors[name].clock = "one" if shared else name
     writer = create(path, sensors)
     rng = np.random.default_rng(4)
-    arriving = sorted(
-        (
-            replace(
-                block,
-                received=type(block.received)(
-                    block.received.monotonic_ns + (late := int(rng.exponential(1e6))),
-                    block.received.utc_ns + late,
-                ),
-            )
-            for name, sensor in sensors.items()
-            for block in blocks(name, sensor)
-        ),
-        key=lambda block: block.received.monotonic_ns,
+    late = (
+        replace(block, received=later(block.received, int(rng.exponential(1e6))))
+        for name, sensor in sensors.items()
+        for block in blocks(name, sensor)
     )
     seen = []
     with Estimation([path], SETTINGS) as live:
         assert not live.update()
         assert live.snapshot().results == {}
-        for number, block in enumerate(arriving):
+        for number, block in enumerate(sorted(late, key=lambda each: each.received.monotonic_ns)):
             writer.append(block)
             if number % 90 == 89:
                 writer.commit()

@@ -43,6 +43,14 @@ from tests.tui.example_snapshot import SETTINGS, growing
 from tests.waiting import limit
 
 
+def closed(path: Path, seconds: float) -> Path:
+    """Write a recording of so many seconds, and close it."""
+    with growing(path) as writer:
+        Bench(writer).send("ABC", seconds)
+        writer.close()
+    return path
+
+
 def test_an_estimate_is_made_only_when_a_segment_has_come(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     with growing(path) as writer:
@@ -121,12 +129,8 @@ def test_a_choice_that_is_refused_ends_nothing(
 
 
 def test_the_end_is_one_result(tmp_path: Path) -> None:
-    path = tmp_path / "run.h5"
-    with growing(path) as writer:
-        Bench(writer).send("ABC", 30)
-        writer.close()
     noted = Noted()
-    result = follow(path, SETTINGS, noted)
+    result = follow(closed(tmp_path / "run.h5", 30), SETTINGS, noted)
     assert noted.snapshots == [result]
     assert result is not None
     assert result.closed
@@ -181,21 +185,13 @@ async def test_samples_that_a_sensor_does_not_count_become_an_event_of_the_recor
 
 
 def test_a_result_that_is_not_wanted_is_not_computed(tmp_path: Path) -> None:
-    path = tmp_path / "run.h5"
-    with growing(path) as writer:
-        Bench(writer).send("ABC", 30)
-        writer.close()
-    noted = Noted(wanted=1)
+    noted, path = Noted(wanted=1), closed(tmp_path / "run.h5", 30)
     assert follow(path, SETTINGS, noted, cancelled=noted.cancelled) is None
     assert not noted.snapshots
 
 
 def test_too_short_a_recording_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "run.h5"
-    with growing(path) as writer:
-        Bench(writer).send("ABC", 1)
-        writer.close()
-    noted = Noted()
+    noted, path = Noted(), closed(tmp_path / "run.h5", 1)
     with pytest.raises(InsufficientDataError, match="record longer"):
         follow(path, SETTINGS, noted)
     assert noted.snapshots[-1].closed
@@ -261,10 +257,7 @@ def test_what_the_disk_refused_is_followed_into_the_next_file(
 ) -> None:
     monkeypatch.setattr(following, "LOOK_SHARE", 1e9)  # nobody waits here
     path = tmp_path / "run.h5"
-    unrelated = tmp_path / "run-2.h5"
-    with growing(unrelated) as writer:
-        Bench(writer).send("ABC", 30)
-        writer.close()
+    closed(tmp_path / "run-2.h5", 30)  # unrelated
     with growing(path, duration=600.0) as first:
         Bench(first).send("ABC", 30)
         with growing(tmp_path / "run-3.h5", continues=first.run_id) as second:

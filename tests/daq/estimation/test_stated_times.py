@@ -19,6 +19,7 @@ from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.segments.stated_times import compare, drift_of
 from daq.estimation.settings import Settings
+from daq.protocols.block import Block
 from daq.recording.reader import Recording
 from daq.results.facts.clocks import (
     ClockNotUnderstood,
@@ -33,7 +34,7 @@ from estimator.spectra.welch import WelchSettings
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
 from tests.daq.clock_facts import clock_facts
-from tests.daq.clocks.recordings import Sensor, blocks, create, write
+from tests.daq.clocks.recordings import Sensor, arriving, create, write
 
 LONG, STUDY = pytest.mark.long, pytest.mark.study
 SETTINGS = Settings(segment=2.0, methods=("three-sensor",))
@@ -196,15 +197,11 @@ def test_drift_is_corrected_while_the_recording_grows(
     sensors = huddle(1e4, ppm)
     if len(ppm) > 3:
         sensors["d"].utc = False
-    arriving = sorted(
-        (block for name, sensor in sensors.items() for block in blocks(name, sensor)),
-        key=lambda block: block.received.monotonic_ns,
-    )
     path = tmp_path / "r.h5"
     writer = create(path, sensors)
     corrected = []
     with Estimation([path], SETTINGS) as estimation:
-        for block in arriving:
+        for block in arriving(sensors):
             writer.append(block)
             if block.first_sample % every == 0 and block.sensor == "c":
                 writer.commit()
@@ -403,16 +400,15 @@ def test_a_step_in_the_middle_is_not_taken_for_noise(
     counts = sensors["c"].counts
     if not is_stated:
         counts[12_000:] = delayed(counts, n_samples)[12_000:]
-    writer = create(tmp_path / "r.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            if is_stated and name == "c" and block.first_sample >= 12_000:
-                assert block.device_counter is not None
-                stated = block.device_counter + round(n_samples / RATE * 1e9)
-                block = replace(block, device_counter=stated)  # noqa: PLW2901
-            writer.append(block)
-    writer.close()
-    snapshot = estimate([tmp_path / "r.h5"], SETTINGS)
+
+    def stepped(block: Block) -> Block:
+        if not is_stated or block.sensor != "c" or block.first_sample < 12_000:
+            return block
+        assert block.device_counter is not None
+        stated = block.device_counter + round(n_samples / RATE * 1e9)
+        return replace(block, device_counter=stated)
+
+    snapshot = estimate([write(tmp_path / "r.h5", sensors, stepped)], SETTINGS)
     low = snapshot.results["three-sensor"].low[BAND].mean(axis=0) / (1e12 * NOISE)
     found = list(clock_facts(snapshot))
     assert {type(each) for each in found} <= {

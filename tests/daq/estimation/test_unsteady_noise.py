@@ -25,6 +25,21 @@ EDGES = np.array([5, 20, 45, 90])
 """Of bands: from 1 to 18 Hz."""
 
 
+def turned(
+    rng: np.random.Generator,
+    motion: np.ndarray,
+    level: np.ndarray | float = 1.0,
+    names: str = "ABC",
+) -> dict[str, np.ndarray]:
+    """Return what sensors in any direction feel of a motion, with noise of this level."""
+    d = motion.shape[1]
+    return {
+        name: motion @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+        + level * rng.standard_normal(motion.shape)
+        for name in names
+    }
+
+
 def level_of(sensor: str, case: str) -> np.ndarray:
     """Return the standard deviation of a sensor's noise at every sample."""
     level = np.ones(N)
@@ -92,11 +107,7 @@ def test_gusts_are_noise_that_changes(n_sensors: int, ratio: float) -> None:
     n = round(600 * RATE)
     motion = np.sqrt(ratio) * rng.standard_normal((n, 2))
     level = np.exp(0.7 * rng.standard_normal(n // 200)).repeat(200)[:, None]  # of 5 s each
-    samples = {
-        name: motion @ np.linalg.qr(rng.standard_normal((2, 2)))[0]
-        + level * rng.standard_normal((n, 2))
-        for name in "ABCDE"[:n_sensors]
-    }
+    samples = turned(rng, motion, level, "ABCDE"[:n_sensors])
     found = huddle.self_noise(samples, fs=RATE, segment="2s").snapshot
     noise, truth = next(iter(found.results.values())), float((level**2).mean()) * 2 / RATE
     low, high = noise.low[5:72], noise.high[5:72]
@@ -222,11 +233,7 @@ def test_gusts_are_no_motion_and_bound_no_level() -> None:
     n = round(600 * RATE)
     motion = 1000 * rng.standard_normal((n, 3))
     level = np.exp(rng.standard_normal(n // 200)).repeat(200)[:, None]  # of 5 s each
-    samples = {
-        name: motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
-        + level * rng.standard_normal((n, 3))
-        for name in "ABCDE"
-    }
+    samples = turned(rng, motion, level, "ABCDE")
     estimate = huddle.self_noise(samples, fs=RATE, segment="5s")
     snapshot, truth = estimate.snapshot, float((level**2).mean()) * 2 / RATE
     found = Result(snapshot, Settings()).spectrum("maximum-likelihood").levels(EDGES)

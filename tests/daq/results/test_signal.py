@@ -11,12 +11,12 @@ import pytest
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
-from daq.protocols.block import Event, HostTime
+from daq.protocols.block import Event
 from daq.recording.reader import Recording
 from daq.results import signal as signals
 from daq.results.signal import CLIPPED, EXCLUDED, GAP, Mark, Signal, Trace, joined
 from estimator.spectra.segment_rejection import Reason
-from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
+from tests.daq.clocks.recordings import ORIGIN, Sensor, later, written
 
 START = ORIGIN.utc_ns * 1e-9
 RATE = 100.0
@@ -32,14 +32,9 @@ def path(tmp_path: Path) -> Path:
         "A": Sensor(samples, channel={"sensitivity": -2.0}),
         "B": Sensor(samples, gaps=((2500, 3500),)),
     }
-    writer = create(tmp_path / "run.h5", sensors)
-    for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
-            writer.append(block)
+    writer = written(tmp_path / "run.h5", sensors)
     writer.gap("B", 2500, 1000, reason="cable pulled")
-    ns = 20 * 10**9
-    at = HostTime(ORIGIN.monotonic_ns + ns, ORIGIN.utc_ns + ns)
-    writer.event(Event("", "mark", "door", at))
+    writer.event(Event("", "mark", "door", later(ORIGIN, 20 * 10**9)))
     writer.close()
     return tmp_path / "run.h5"
 
