@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_sensors import Rotated
 from estimator.checks.diagnose import diagnose
-from estimator.checks.relative_response import relative_response
+from estimator.checks.relative_response import RelativeResponse, relative_response
 from estimator.checks.rules import orientation
 from estimator.checks.shared_motion import CanonicalCoherence, matched_coherence
 from estimator.errors import EstimatorError, InsufficientDataError
@@ -37,11 +38,23 @@ def bench(
     return np.asarray(csm, np.complex128)
 
 
+def between(
+    csm: ComplexArray,
+    frequency: FloatArray = FREQUENCY,
+    first: int = 0,
+    second: int = 1,
+    **options: Any,  # noqa: ANN401 - those of relative_response
+) -> RelativeResponse:
+    """Return the response of one triaxial sensor to another."""
+    dims = options.pop("dims", (3,) * (csm.shape[1] // 3))
+    return relative_response(csm, frequency, dims=dims, first=first, second=second, **options)
+
+
 def test_rotation_gains_and_delay_are_recovered() -> None:
     turned = Rotation.from_rotvec(np.deg2rad(4.1) * np.array([0.6, 0, 0.8])).as_matrix().T
     gains = np.array([1.02, 0.97, 1.0])
     csm = bench([np.eye(3), gains[:, None] * turned, np.eye(3)], delays=(0, 3e-3, -1e-3))
-    found = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
+    found = between(csm)
     assert found.rotation_deg == pytest.approx(4.1, abs=1e-3)
     np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
     np.testing.assert_allclose(found.gains, gains, rtol=1e-6)
@@ -49,7 +62,7 @@ def test_rotation_gains_and_delay_are_recovered() -> None:
     assert found.nonorthogonality_deg < 1e-4
     assert found.reversed_channels == ()
     assert np.isnan(found.horizontal_deg)
-    back = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=1, second=0)
+    back = between(csm, first=1, second=0)
     assert back.delay == pytest.approx(-3e-3, rel=1e-6)
     np.testing.assert_allclose(back.matrix @ found.matrix, np.eye(3), atol=1e-6)
 
@@ -59,7 +72,7 @@ def test_others_that_lag_do_not_cancel_in_sums_over_the_band(n_others: int) -> N
     gains, late = np.array([1.02, 0.97, 1.0]), (0.0, 2e-3, *(0.4, -0.7)[:n_others])
     true = bench([np.eye(3), np.diag(gains), *[np.eye(3)] * n_others], delays=late)
     csm = wishart(true, 60, np.random.default_rng(5))[0]
-    found = relative_response(csm, FREQUENCY, dims=(3,) * len(late), first=0, second=1)
+    found = between(csm)
     assert found.rotation_deg < 0.1
     np.testing.assert_allclose(found.gains, gains, atol=1e-3)
     assert found.delay == pytest.approx(2e-3, abs=1e-5)
@@ -76,9 +89,7 @@ def test_a_known_delay_has_the_sign_the_convention_says() -> None:
     samples = np.column_stack([now, late, now]) + 0.01 * rng.standard_normal((40_000, 3))
     spectra = CrossSpectra(settings, 3)
     spectra.add(samples, np.arange(0, 40_000 - 400, settings.hop, dtype=np.int64))
-    found = relative_response(
-        spectra.csm(), settings.frequencies, dims=(1, 1, 1), first=0, second=1, band=(1, 40)
-    )
+    found = between(spectra.csm(), settings.frequencies, dims=(1, 1, 1), band=(1, 40))
     assert found.delay == pytest.approx(0.015, rel=0.01)
 
 
@@ -89,7 +100,7 @@ def test_a_delay_of_many_periods_is_not_mistaken_for_a_short_one(delay: float, l
     turned = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
     csm = bench([np.eye(3), turned, np.eye(3)], delays=(0, delay, 0), snr=100)
     draw = wishart(csm, 300, np.random.default_rng(4))[0]
-    found = relative_response(draw, FREQUENCY, dims=(3, 3, 3), first=0, second=1, band=(low, 20.0))
+    found = between(draw, band=(low, 20.0))
     assert found.delay == pytest.approx(delay, abs=1e-4)
     np.testing.assert_allclose(found.matrix, turned, atol=0.02)
 
@@ -98,7 +109,7 @@ def test_a_delay_is_found_at_frequencies_that_are_not_evenly_spaced() -> None:
     """As where octaves have segments of their own, or frequencies are flagged."""
     csm = bench([np.eye(3)] * 3, delays=(0, 0.31, 0))
     some = np.sort(np.random.default_rng(0).choice(200, 60, replace=False))
-    found = relative_response(csm[some], FREQUENCY[some], dims=(3, 3, 3), first=0, second=1)
+    found = between(csm[some], FREQUENCY[some])
     assert found.delay == pytest.approx(0.31, rel=1e-6)
 
 
@@ -113,9 +124,7 @@ def test_frequencies_are_weighted_by_signal_to_noise_ratio() -> None:
     whole: list[list[float]] = []
     for draw in wishart(csm, 100, np.random.default_rng(6), n_draws=25):
         for found, some in ((alone, good), (whole, np.ones(200, bool))):
-            response = relative_response(
-                draw[some], FREQUENCY[some], dims=(3, 3, 3), first=0, second=1
-            )
+            response = between(draw[some], FREQUENCY[some])
             found.append([*response.gains - 1, response.delay * 100])
     spread = np.std(whole, axis=0) / np.std(alone, axis=0)
     assert spread.max() < 1.5  # all alike would make it 15 times as large
@@ -128,7 +137,7 @@ def test_horizontal_angle_follows_the_first_horizontal_channel() -> None:
         [[1, 0, 0], [0, np.cos(north), -np.sin(north)], [0, np.sin(east), np.cos(east)]]
     )
     csm = bench([np.eye(3), second, np.eye(3)])
-    found = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=0, second=1, vertical=0)
+    found = between(csm, vertical=0)
     assert found.horizontal_deg == pytest.approx(10, abs=1e-3)
     assert found.rotation_deg == pytest.approx(11, abs=1e-2)
     assert found.nonorthogonality_deg == pytest.approx(2, abs=1e-3)
@@ -137,7 +146,7 @@ def test_horizontal_angle_follows_the_first_horizontal_channel() -> None:
 def test_reversed_polarity_is_named() -> None:
     second = np.diag([1.0, -1.0, 1.0]) @ Rotation.from_euler("z", 5, degrees=True).as_matrix()
     csm = bench([np.eye(3), second, np.eye(3)], delays=(0, 2e-3, 0))
-    found = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
+    found = between(csm)
     assert found.reversed_channels == (1,)
     assert found.rotation_deg == pytest.approx(5, abs=1e-3)
     assert found.delay == pytest.approx(2e-3, rel=1e-3)
@@ -154,7 +163,7 @@ def test_noise_causes_no_bias_and_the_error_covers(peak: float) -> None:
     csm[5:7] += (peak - 1) * (csm[5:7] - np.eye(9))
     miss, errors = [], []
     for draw in wishart(csm, 200, np.random.default_rng(2), n_draws=60):
-        found = relative_response(draw, FREQUENCY, dims=(3, 3, 3), first=0, second=1, vertical=2)
+        found = between(draw, vertical=2)
         miss.append(found.horizontal_deg - 3)
         errors.append(found.angle_error_deg)
         np.testing.assert_allclose(found.gains, 1, atol=0.02)
@@ -172,9 +181,7 @@ def test_equal_sensors_in_weak_motion_are_not_said_to_differ(
     kinds = [
         found.name
         for draw in wishart(csm, 20, np.random.default_rng(5), n_draws=25)
-        for found in orientation(
-            relative_response(draw, frequency, dims=dims, first=0, second=1), dims, 20.0
-        )
+        for found in orientation(between(draw, frequency, dims=dims), dims, 20.0)
     ]
     assert len(kinds) <= 1
 
@@ -189,7 +196,7 @@ def test_frequencies_are_not_chosen_by_their_own_noise(snr: tuple[float, ...]) -
     gains = []
     for draw in wishart(csm, 84, np.random.default_rng(1), n_draws=30):
         with suppress(InsufficientDataError):
-            found = relative_response(draw, frequency, dims=(1, 1, 1), first=0, second=1)
+            found = between(draw, frequency, dims=(1, 1, 1))
             gains.append(found.gains[0])
     assert len(gains) == (0 if 0.85 in snr else 30)
     assert all(abs(gain - 1) < 0.02 for gain in gains)
@@ -199,7 +206,7 @@ def test_frequencies_are_not_chosen_by_their_own_noise(snr: tuple[float, ...]) -
 def test_more_sensors_and_one_channel() -> None:
     gains = [1.0, 1.1, 0.9, 1.2]
     csm = bench([np.array([[gain]]) for gain in gains], delays=(0, 1e-3, 0, 0))
-    found = relative_response(csm, FREQUENCY, dims=(1,) * 4, first=0, second=1)
+    found = between(csm, dims=(1,) * 4)
     assert found.gains[0] == pytest.approx(1.1, rel=1e-6)
     assert found.delay == pytest.approx(1e-3, rel=1e-6)
     assert found.rotation_deg == 0
@@ -226,7 +233,7 @@ def test_canonical_coherence_does_not_depend_on_orientation() -> None:
 def test_any_rotation_is_found() -> None:
     turned = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()
     csm = bench([np.eye(3), turned, turned.T])
-    found = relative_response(csm, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
+    found = between(csm)
     assert found.rotation_deg == pytest.approx(np.rad2deg(np.linalg.norm([1, 2, 0.5])), abs=1e-3)
     np.testing.assert_allclose(found.rotation, turned, atol=1e-6)
 
@@ -234,15 +241,15 @@ def test_any_rotation_is_found() -> None:
 def test_sensors_that_are_not_comparable_are_refused() -> None:
     csm = bench([np.eye(3), np.eye(3)[:2], np.eye(3)])
     with pytest.raises(InsufficientDataError, match="3 and 2 channels"):
-        relative_response(csm, FREQUENCY, dims=(3, 2, 3), first=0, second=1)
+        between(csm, dims=(3, 2, 3))
     with pytest.raises(InsufficientDataError, match="others have 2"):
-        relative_response(csm, FREQUENCY, dims=(3, 2, 3), first=0, second=2)
+        between(csm, second=2, dims=(3, 2, 3))
     quiet = np.broadcast_to(np.eye(9, dtype=np.complex128), (200, 9, 9))
     for first, second in ((0, 0), (0, 5), (-1, 0)):
         with pytest.raises(EstimatorError, match="two different ones of 0 to 2"):
-            relative_response(quiet, FREQUENCY, dims=(3, 3, 3), first=first, second=second)
+            between(quiet, first=first, second=second)
     with pytest.raises(InsufficientDataError, match="coherent"):
-        relative_response(quiet, FREQUENCY, dims=(3, 3, 3), first=0, second=1)
+        between(quiet)
 
 
 @pytest.fixture(scope="module")
@@ -279,15 +286,7 @@ def test_horizontal_angles_of_the_real_recording(
 ) -> None:
     """Published angles are those of BH1; BH2 turns by 0.2 to 0.3 degrees more or less."""
     csm, frequencies, _ = tst
-    found = relative_response(
-        csm,
-        frequencies,
-        dims=(3, 3, 3),
-        first=first,
-        second=second,
-        vertical=0,
-        band=band,
-    )
+    found = between(csm, frequencies, first, second, vertical=0, band=band)
     assert found.horizontal_deg == pytest.approx(angle, abs=0.05)
     assert found.angle_error_deg < 0.05
     np.testing.assert_allclose(found.gains, 1, atol=0.01)
@@ -328,7 +327,7 @@ def test_frequencies_that_are_not_known_have_no_part_in_a_response() -> None:
     known = np.isfinite(csm).all(axis=(1, 2))
     for first, second in ((0, 1), (0, 3), (1, 3)):
         found, without = (
-            relative_response(csm[some], FREQUENCY[some], dims=dims, first=first, second=second)
+            between(csm[some], FREQUENCY[some], first, second, dims=dims)
             for some in (slice(None), known)
         )
         np.testing.assert_allclose(found.matrix, without.matrix, rtol=1e-9)
