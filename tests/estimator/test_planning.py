@@ -54,7 +54,7 @@ def test_estimates_have_the_planned_precision(method: str) -> None:
     directions = np.tile(rotation(rng, 3), (3, 1))
     csm, noise_psd = planned_csm(directions, snr=100, noise_psd=np.linspace(0.5, 2, 9))
     plans = {p.method: p for p in plan(csm, noise_psd, dims=(3, 3, 3), settings=PAPER, cov=0.2)}
-    n_draws = 300 if method == "maximum-likelihood" else 700
+    n_draws = 200 if method == "maximum-likelihood" else 500
     for channel in (0, 8):
         n = round(plans[method].n_effective[0, channel])
         sample = wishart(csm[0], n, rng, n_draws=n_draws)

@@ -72,14 +72,14 @@ def test_noise_is_that_without_bounds_and_structure(
     loudness: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(5)
-    p, n, n_bins = len(TRIAXIAL), 60, 24
+    p, n, n_bins = len(TRIAXIAL), 60, 12
     felt = normal(rng, p, 3) * [3 * loudness, loudness, 0.4]
     felt[3:6, 1] *= 4  # a dimension that one sensor makes strong
     drawn = normal(rng, n_bins, p, n) + felt @ normal(rng, n_bins, 3, n)
     matrix = drawn @ drawn.conj().swapaxes(1, 2) / (2 * n)
 
     def noise() -> Pooled:
-        block, q = np.repeat(np.arange(3), 8), np.repeat([1, 2, 3], 8)
+        block, q = np.repeat(np.arange(3), 4), np.repeat([1, 2, 3], 4)
         return pooled_noise(
             matrix, block, q, dims=(3,) * 9, n_effective=n, correlation=np.array([1.0])
         )

@@ -239,13 +239,13 @@ def test_motion_shows_beside_strong_noise_of_one_sensor() -> None:
     held, within = [], np.zeros((9, 9))
     within[3:6, 3:6] = np.outer([4.0, 2.0, 0.0], [4.0, 2.0, 0.0])
     noise = np.ones(9) + np.diag(within)
-    for seed in range(40):
+    for seed in range(24):
         rng = np.random.default_rng([46, seed])
         axes = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(3)])
         csm = (axes * [0.1, 0.14, 0.07]) @ axes.T + np.eye(9) + within
         sample = drawn(rng, np.broadcast_to(csm, (40, 9, 9)).astype(np.complex128), 60)
         held.append(judged(beside(sample, 60), noise)[0])
-    assert np.mean(held) > least(360)
+    assert np.mean(held) > least(216)
 
 
 @pytest.mark.parametrize("snr", [0.0, 0.02, 0.05])

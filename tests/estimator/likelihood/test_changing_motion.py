@@ -23,7 +23,7 @@ from tests.estimator.csm_models import rotation, wishart
 N_PARTS = 12
 N_BINS = 10
 AVERAGES = 60
-DRAWS = 40
+DRAWS = 30
 CHANGING = 6.0  # dB
 
 
