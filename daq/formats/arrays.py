@@ -333,7 +333,7 @@ def attached_responses(sensors: Any) -> dict[str, Any]:  # noqa: ANN401 - whatev
         for trace in [stream] if hasattr(stream, "stats") else stream:
             stats = trace.stats
             if stats.get("response") is not None and not is_corrected(stats):
-                (known,) = stream_part([trace], NAME).traces
+                (known,) = stream_part([trace], NAME).load()
                 found[f"{name or known.sensor}.{known.channel}"] = stats.response
     return found
 

@@ -226,7 +226,7 @@ def _same(last: Piece, piece: Piece, n_common: int, steps: float, cache: PartCac
 
 
 def _overlapping(where: str, last: Piece, piece: Piece) -> str:
-    sources = dict.fromkeys((last.part.source, piece.part.source))
+    sources = dict.fromkeys((str(last.part.path), str(piece.part.path)))
     if piece.start_ns < FIRST_DATE_NS:
         return (
             f"{where} is in {' and in '.join(sources)}, without a date; expected each sensor once,"
@@ -388,7 +388,7 @@ def assembled(
         for channel, pieces in channels.items()
     ]
     stretches = tuple(_stretches(of_channel, rate))
-    sources = list(dict.fromkeys(p.part.source for pieces in channels.values() for p in pieces))
+    sources = list(dict.fromkeys(str(p.part.path) for pieces in channels.values() for p in pieces))
     more = len(sources) - _PIECES_NAMED
     source = ", ".join(sources[:_PIECES_NAMED]) + (f" and {more} more" if more > 0 else "")
     return ForeignSensor(name, tuple(channels), rate, stretches, source, tuple(units))

@@ -17,31 +17,19 @@ from typing import TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import SAME_RATE, Overlap, assembled
-from daq.formats.foreign_sensor import FIRST_DATE_NS, ForeignCalibration, ForeignSensor
+from daq.formats.foreign_sensor import FIRST_DATE_NS, NS_PER_S, ForeignCalibration, ForeignSensor
 from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
-from daq.formats.readers.waveforms import waveform_parts
-from daq.formats.traces import FilePart, PartCache, Piece, Trace, TracePart, pieces_of, traces_of
+from daq.formats.readers.waveforms import waveform_part
+from daq.formats.traces import PartCache, Piece, ReadPart, TracePart, pieces_of, traces_of
 
 Progress: TypeAlias = Callable[[str], None]
 WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]
 
 SCHEME = "sds://"
 _N_FIELDS = 7
-_NS_PER_S = 1_000_000_000
-
-
-def sds_files(url: str, codes: Selection) -> Iterator[Path]:
-    """Yield the waveform files of an archive by channel and day.
-
-    Raises
-    ------
-    ImportFormatError
-        There is no such folder.
-    """
-    yield from (path for *_, path in sds_days(url, codes))
 
 
 def sds_days(url: str, codes: Selection) -> list[tuple[str, datetime, Path]]:
@@ -74,24 +62,18 @@ def sds_days(url: str, codes: Selection) -> list[tuple[str, datetime, Path]]:
 
 
 def _day(instant_ns: int) -> datetime:
-    when = datetime.fromtimestamp(instant_ns // _NS_PER_S, tz=UTC)
+    when = datetime.fromtimestamp(instant_ns // NS_PER_S, tz=UTC)
     return when.replace(hour=0, minute=0, second=0)
 
 
 _UNIVERSAL = frozenset({".uff", ".unv", ".uf58", ".58"})
-_BY_SUFFIX: dict[str, WholeFile] = {
-    ".wav": read_wav,
-    ".npz": read_npz,
-    ".mat": read_mat,
-}
+_BY_SUFFIX: dict[str, WholeFile] = {".wav": read_wav, ".npz": read_npz, ".mat": read_mat}
 _DELIMITED = frozenset({".csv", ".tsv", ".txt", ".lvm"})
 _ASCII = b"TIMESERIES "
 """With which the texts of data centres begin, SLIST and TSPAIR."""
 
 
-def parts_of(
-    path: Path, sampling_rate: float | None = None, columns: str = ""
-) -> Iterator[TracePart]:
+def parts_of(path: Path, sampling_rate: float | None, columns: str) -> Iterator[TracePart]:
     """Yield the parts of a file.
 
     Parameters
@@ -105,27 +87,29 @@ def parts_of(
     Raises
     ------
     ImportFormatError
-        It cannot be read.
+        It is no file, or cannot be read.
     """
+    if path.is_dir():
+        raise ImportFormatError(
+            f"{path}: a folder; expected files, or sds://{path} for an archive of day files"
+        )
+    if not path.is_file():
+        raise ImportFormatError(f"{path}: no such file")
     with path.open("rb") as file:
         is_ascii = file.read(len(_ASCII)) == _ASCII
     whole = _BY_SUFFIX.get(path.suffix.lower())
     if path.suffix.lower() in _DELIMITED and not is_ascii:
         whole = partial(read_delimited, columns=columns)
     if whole is not None:
-        yield FilePart(path, partial(_load, whole, sampling_rate))
+        yield ReadPart(path, lambda path: traces_of(whole(path, sampling_rate)))
     elif path.suffix.lower() in _UNIVERSAL:
-        yield FilePart(path, read_uff)
+        yield ReadPart(path, read_uff)
     elif path.suffix.lower() == ".tdms":
         yield from tdms_parts(path, sampling_rate)
     elif is_miniseed(path):
         yield from miniseed_parts(path)
     else:
-        yield from waveform_parts(path)
-
-
-def _load(read: WholeFile, sampling_rate: float | None, path: Path) -> list[Trace]:
-    return traces_of(read(path, sampling_rate))
+        yield waveform_part(path)
 
 
 _LOGGER = logging.getLogger(__name__)
@@ -227,16 +211,15 @@ def open_sources(
     """
     selection = selection or Selection()
     cache = PartCache() if cache is None else cache
-    index = _Index(selection)
-    problems: list[str] = []
-    n_files = 0
-    for order, path in enumerate(_files(sources, selection)):
+    index = _Index(selection, cache)
+    problems, n_files = index.problems, 0
+    for path in _files(sources, selection):
         n_files += 1
         try:
             n_problems = len(problems)
-            for part in _parts(path, sampling_rate, selection.columns):
+            for part in parts_of(path, sampling_rate, selection.columns):
                 if part.reaches(selection.start_ns, selection.end_ns):
-                    index.add(part, cache, order, problems)
+                    index.add(part, n_files)
         except (ImportFormatError, OSError) as error:
             problems.append(_message(path, error))
             continue
@@ -246,7 +229,7 @@ def open_sources(
     sensors: dict[str, ForeignSensor] = {}
     for name in index.names:
         try:
-            sensor = index.sensor(name, cache, problems)
+            sensor = index.sensor(name)
             sensor.check()
         except ImportFormatError as error:
             problems.append(str(error))
@@ -260,19 +243,9 @@ def open_sources(
 def _files(sources: Sequence[str | Path], selection: Selection) -> Iterable[Path]:
     for source in sources:
         if str(source).startswith(SCHEME):
-            yield from sds_files(str(source), selection)
+            yield from (path for *_, path in sds_days(str(source), selection))
         else:
             yield Path(source)
-
-
-def _parts(path: Path, sampling_rate: float | None, columns: str) -> Iterator[TracePart]:
-    if path.is_dir():
-        raise ImportFormatError(
-            f"{path}: a folder; expected files, or sds://{path} for an archive of day files"
-        )
-    if not path.is_file():
-        raise ImportFormatError(f"{path}: no such file")
-    yield from parts_of(path, sampling_rate, columns)
 
 
 def _message(path: Path, error: Exception) -> str:
@@ -290,10 +263,11 @@ def _nothing(index: _Index, n_files: int, selection: Selection) -> str:
 
 
 class _Index:
-    """The pieces that files hold, by sensor and channel."""
+    """The pieces that files hold, by sensor and channel; `problems` are what cannot be used."""
 
-    def __init__(self, selection: Selection) -> None:
-        self._selection = selection
+    def __init__(self, selection: Selection, cache: PartCache) -> None:
+        self._selection, self._cache = selection, cache
+        self.problems: list[str] = []
         self._pieces: dict[str, dict[str, list[Piece]]] = {}
         self._units: dict[tuple[str, str], str] = {}
         self._calibrations: dict[tuple[str, str], ForeignCalibration | None] = {}
@@ -317,16 +291,16 @@ class _Index:
         )
         return 2 * sum(largest)
 
-    def add(self, part: TracePart, cache: PartCache, order: int, problems: list[str]) -> None:
+    def add(self, part: TracePart, order: int) -> None:
         """Take a part; what cannot be read of it is a problem."""
         try:
-            traces = cache.traces(part)
+            traces = self._cache.traces(part)
         except ImportFormatError as error:
             smaller = part.split()
             if not smaller:
-                problems.append(str(error))
+                self.problems.append(str(error))
             for each in smaller:
-                self.add(each, cache, order, problems)
+                self.add(each, order)
             return
         for trace, piece in pieces_of(part, traces, order):
             name = f"{trace.sensor}.{trace.channel}"
@@ -342,15 +316,15 @@ class _Index:
             if self._selection.unit and unit in {"", "counts"} and trace.calibration is None:
                 unit = self._selection.unit
             if self._units.setdefault(key, unit) != unit:
-                problems.append(
-                    f"{part.source}: {name} in {unit or 'counts'}, in another file in"
+                self.problems.append(
+                    f"{part.path}: {name} in {unit or 'counts'}, in another file in"
                     f" {self._units[key] or 'counts'}; expected one unit"
                 )
                 continue
             known = self._calibrations.setdefault(key, trace.calibration)
             if trace.calibration != known:
-                problems.append(
-                    f"{part.source}: {name} has {_calibrated(trace.calibration)}, in another file"
+                self.problems.append(
+                    f"{part.path}: {name} has {_calibrated(trace.calibration)}, in another file"
                     f" {_calibrated(known)}; expected one: import what has the same together"
                 )
                 continue
@@ -358,7 +332,7 @@ class _Index:
                 self._coded.add(trace.sensor)
             self._pieces.setdefault(trace.sensor, {}).setdefault(trace.channel, []).append(cut)
 
-    def sensor(self, name: str, cache: PartCache, problems: list[str]) -> ForeignSensor:
+    def sensor(self, name: str) -> ForeignSensor:
         """Return a sensor; a channel that contradicts itself is a problem, the others are taken.
 
         Raises
@@ -372,22 +346,20 @@ class _Index:
         if len(channels) > 1:
             for channel in list(channels):
                 try:
-                    self._assembled(name, {channel: channels[channel]}, cache)
+                    self._assembled(name, {channel: channels[channel]})
                 except ImportFormatError as error:
-                    problems.append(str(error))
+                    self.problems.append(str(error))
                     channels = {key: channels[key] for key in channels if key != channel}
         if not channels:
             raise ImportFormatError(f"sensor {name!r}: none of its channels can be used")
-        return self._assembled(name, channels, cache)
+        return self._assembled(name, channels)
 
     def _fastest(self, name: str, channels: dict[str, list[Piece]]) -> dict[str, list[Piece]]:
         """Leave aside what is there at a higher rate too: BHZ beside HHZ, of one sensor."""
         rates = {code: max(p.sampling_rate for p in channels[code]) for code in channels}
         kept = {}
         for code, pieces in channels.items():
-            alike = [
-                each for each in channels if each[1:] == code[1:] and len(code) == _CODE_LENGTH
-            ]
+            alike = [c for c in channels if c[1:] == code[1:] and len(code) == _CODE_LENGTH]
             best = max(alike, key=lambda each: rates[each], default=code)
             if rates[best] > rates[code] * (1 + SAME_RATE):
                 reason = f"{rates[code]:g} Hz, where {best[0]}{code[1]} has {rates[best]:g} Hz"
@@ -396,12 +368,10 @@ class _Index:
                 kept[code] = pieces
         return kept
 
-    def _assembled(
-        self, name: str, channels: dict[str, list[Piece]], cache: PartCache
-    ) -> ForeignSensor:
+    def _assembled(self, name: str, channels: dict[str, list[Piece]]) -> ForeignSensor:
         units = [self._units[name, channel] for channel in channels]
         known = [unit or "counts" for unit in units] if any(units) else []
-        found = assembled(name, channels, known, self._selection.overlap, cache)
+        found = assembled(name, channels, known, self._selection.overlap, self._cache)
         calibrations = tuple(self._calibrations[name, channel] for channel in channels)
         return replace(found, calibrations=calibrations) if any(calibrations) else found
 
@@ -434,11 +404,10 @@ def sensors_of_parts(parts: Iterable[TracePart]) -> tuple[ForeignSensor, ...]:
     ImportFormatError
         With what is wrong.
     """
-    cache, problems = PartCache(), list[str]()
-    index = _Index(Selection(channels=("*",)))
+    index = _Index(Selection(channels=("*",)), PartCache())
     for order, part in enumerate(parts):
-        index.add(part, cache, order, problems)
-    sensors = tuple(index.sensor(name, cache, problems) for name in index.names)
-    if problems:
-        raise ImportFormatError(problems[0])
+        index.add(part, order)
+    sensors = tuple(map(index.sensor, index.names))
+    if index.problems:
+        raise ImportFormatError(index.problems[0])
     return sensors

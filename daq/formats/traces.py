@@ -17,7 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,68 +64,35 @@ class Trace:
     calibration: ForeignCalibration | None = None
 
 
-class TracePart(Protocol):
-    """Some traces of a file."""
+@dataclass(frozen=True, slots=True, eq=False)
+class TracePart:
+    """Some traces of a file; `path` is what messages call it."""
 
-    @property
-    def source(self) -> str:
-        """The file, in messages."""
+    path: Path
 
     def load(self) -> Sequence[Trace]:
         """Return its traces, every time the same."""
+        raise NotImplementedError
 
     def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
         """Whether it may have samples between two instants of UTC; it is not loaded for that."""
-
-    def split(self) -> Sequence[TracePart]:
-        """Return smaller parts, of which some may be sound; nothing if there are none."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadedPart:
-    """Traces that are in memory."""
-
-    source: str
-    traces: Sequence[Trace]
-
-    def load(self) -> Sequence[Trace]:
-        """Return the traces."""
-        return self.traces
-
-    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
-        """Return True: what it has is known when it is loaded."""
         del start_ns, end_ns
         return True
 
     def split(self) -> Sequence[TracePart]:
-        """Return nothing: it is read as a whole."""
+        """Return smaller parts, of which some may be sound; nothing if there are none."""
         return ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilePart:
-    """A whole file, read by `read`."""
+class ReadPart(TracePart):
+    """What `read` returns of a file; it is read as a whole."""
 
-    path: Path
     read: Callable[[Path], Sequence[Trace]]
-
-    @property
-    def source(self) -> str:
-        """The file, in messages."""
-        return str(self.path)
 
     def load(self) -> Sequence[Trace]:
         """Read the file."""
         return self.read(self.path)
-
-    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
-        """Return True: what it has is known when it is loaded."""
-        del start_ns, end_ns
-        return True
-
-    def split(self) -> Sequence[TracePart]:
-        """Return nothing: it is read as a whole."""
-        return ()
 
 
 def traces_of(sensors: Iterable[ForeignSensor]) -> list[Trace]:
@@ -248,7 +215,7 @@ class PartCache:
             if len(found) == end - first:
                 return found
         raise ImportFormatError(
-            f"{piece.part.source}: changed while it was read; import it when it is complete"
+            f"{piece.part.path}: changed while it was read; import it when it is complete"
         )
 
 

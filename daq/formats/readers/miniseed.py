@@ -17,7 +17,7 @@ from typing import Any
 
 from daq.errors import ImportFormatError
 from daq.formats.readers.packages import load
-from daq.formats.traces import Trace
+from daq.formats.traces import Trace, TracePart
 
 _PART_BYTES = 1 << 20
 _HEADER_BYTES = 40
@@ -38,27 +38,18 @@ def _is_header(head: bytes) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MiniSeedPart:
+class MiniSeedPart(TracePart):
     """Records of a file, from one byte to another; `record_length` is 0 if it varies."""
 
-    path: Path
     offset: int
     end: int
     record_length: int
-
-    @property
-    def source(self) -> str:
-        """The file, in messages."""
-        return str(self.path)
 
     def load(self) -> Sequence[Trace]:
         """Return the traces in these records; text, such as a log, is left out."""
         pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
         try:
-            with self.path.open("rb") as file:
-                file.seek(self.offset)
-                content = file.read(self.end - self.offset)
-            found = pymseed.MS3TraceList.from_buffer(content, unpack_data=True, record_list=True)
+            found = self._listed(pymseed, unpack_data=True)
             traces = [
                 _trace(pymseed, trace.sourceid, segment, self.path, number)
                 for number, trace in enumerate(found, start=1)
@@ -68,10 +59,21 @@ class MiniSeedPart:
             n_records = sum(s.recordlist.recordcnt for trace in found for s in trace)
         except (pymseed.MiniSEEDError, ValueError, OverflowError) as error:
             raise self._damaged(str(error)) from error
-        n_expected = -(-len(content) // self.record_length) if self.record_length else 1
-        if n_records < n_expected:  # libmseed passes over what is no record
-            raise self._damaged(f"{n_records} of {n_expected} records can be read")
+        if n_records < self._n_records:  # libmseed passes over what is no record
+            raise self._damaged(f"{n_records} of {self._n_records} records can be read")
         return traces
+
+    def _listed(self, pymseed: Any, **options: bool) -> Any:  # noqa: ANN401 - see above
+        """Return what libmseed finds in these bytes."""
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            content = file.read(self.end - self.offset)
+        return pymseed.MS3TraceList.from_buffer(content, record_list=True, **options)
+
+    @property
+    def _n_records(self) -> int:
+        """Records that it must have: one at least, where their lengths vary."""
+        return -(-(self.end - self.offset) // self.record_length) if self.record_length else 1
 
     def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
         """Whether a record has samples between two instants, by headers; a damaged part may."""
@@ -79,17 +81,11 @@ class MiniSeedPart:
             return True
         pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
         try:
-            with self.path.open("rb") as file:
-                file.seek(self.offset)
-                content = file.read(self.end - self.offset)
-            found = pymseed.MS3TraceList.from_buffer(content, record_list=True)
-            segments = [segment for trace in found for segment in trace]
-            n_records = sum(segment.recordlist.recordcnt for segment in segments)
+            segments = [segment for trace in self._listed(pymseed) for segment in trace]
         except (pymseed.MiniSEEDError, ValueError, OverflowError):
             return True
-        if n_records * (self.record_length or len(content)) < len(content):
-            return True
-        return any(
+        n_records = sum(segment.recordlist.recordcnt for segment in segments)
+        return n_records < self._n_records or any(
             (end_ns is None or segment.starttime < end_ns)
             and (start_ns is None or segment.endtime >= start_ns)
             for segment in segments
@@ -97,10 +93,9 @@ class MiniSeedPart:
 
     def split(self) -> Sequence[MiniSeedPart]:
         """Return both halves of a part that is damaged somewhere; nothing if it is one record."""
-        n_records = -(-(self.end - self.offset) // (self.record_length or 1))
-        if n_records < 2 or not self.record_length:
+        if self._n_records < 2:
             return ()
-        middle = self.offset + n_records // 2 * self.record_length
+        middle = self.offset + self._n_records // 2 * self.record_length
         return (
             MiniSeedPart(self.path, self.offset, middle, self.record_length),
             MiniSeedPart(self.path, middle, self.end, self.record_length),

@@ -29,24 +29,18 @@ import numpy as np
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignCalibration, ForeignSensor, finite_stretches
 from daq.formats.readers.packages import load
-from daq.formats.traces import Trace
+from daq.formats.traces import Trace, TracePart
 
 _SAMPLES = 1 << 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TdmsPart:
-    """Samples of all channels of a file, from one to another."""
+class TdmsPart(TracePart):
+    """Samples of all channels of a file, from one to another; npTDMS reads no pieces of these."""
 
-    path: Path
     first: int
     end: int
     sampling_rate: float | None
-
-    @property
-    def source(self) -> str:
-        """The file, in messages."""
-        return str(self.path)
 
     def load(self) -> list[Trace]:
         """Read the samples."""
@@ -63,15 +57,6 @@ class TdmsPart:
             raise
         except Exception as error:
             raise ImportFormatError(f"{self.path}: npTDMS cannot read it: {error}") from error
-
-    def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
-        """Return True: what it has is known when it is loaded."""
-        del start_ns, end_ns
-        return True
-
-    def split(self) -> tuple[TdmsPart, ...]:
-        """Return nothing: what npTDMS cannot read, it cannot read in pieces."""
-        return ()
 
     def _trace(self, group: str, channel: Any) -> Trace:  # noqa: ANN401 - see above
         properties = channel.properties

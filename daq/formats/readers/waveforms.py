@@ -13,7 +13,6 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,7 +23,7 @@ from daq.bench.units import STANDARD_GRAVITY
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import ForeignCalibration
 from daq.formats.readers.packages import load
-from daq.formats.traces import FilePart, LoadedPart, Trace
+from daq.formats.traces import ReadPart, Trace
 
 FORMATS = (
     *("MSEED", "SAC", "GSE2", "GSE1", "SLIST", "TSPAIR", "SEGY", "SEG2", "WAV", "KNET"),
@@ -97,14 +96,14 @@ def _refuse_others(path: Path) -> None:
             raise ImportFormatError(what.replace("FILE", path.stem))
 
 
-def waveform_parts(path: Path) -> Iterator[FilePart]:
-    """Yield a file as one part."""
+def waveform_part(path: Path) -> ReadPart:
+    """Return a file as one part."""
     _refuse_others(path)
     load_obspy()
-    yield FilePart(path, _read)
+    return ReadPart(path, _read)
 
 
-def _read(path: Path) -> Sequence[Trace]:
+def _read(path: Path) -> list[Trace]:
     obspy = load_obspy()
     try:
         with warnings.catch_warnings():
@@ -113,12 +112,11 @@ def _read(path: Path) -> Sequence[Trace]:
             name = waveform_format(path) if source is None else "SAC"
             source = source or glob.escape(str(path))
             stream = obspy.read(source, format=name, check_compression=False)
-            traces = _traces(stream, path.stem, numbered=name in _NUMBERED)
+            return _traces(stream, path.stem, numbered=name in _NUMBERED)
     except ImportFormatError as error:
         raise ImportFormatError(f"{path}: {error}") from error
     except Exception as error:
         raise ImportFormatError(f"{path}: ObsPy cannot read it: {error}") from error
-    return traces
 
 
 def _sac_with_ones(path: Path) -> io.BytesIO | None:
@@ -138,9 +136,10 @@ def _sac_with_ones(path: Path) -> io.BytesIO | None:
         return io.BytesIO(bytes(head) + file.read())
 
 
-def stream_part(stream: Stream, source: str) -> LoadedPart:
+def stream_part(stream: Stream, source: str) -> ReadPart:
     """Return the traces of a stream that is in memory."""
-    return LoadedPart(source, _traces(stream, source, numbered=False))
+    traces = _traces(stream, source, numbered=False)
+    return ReadPart(Path(source), lambda _: traces)
 
 
 def _traces(stream: Stream, fallback: str, *, numbered: bool) -> list[Trace]:

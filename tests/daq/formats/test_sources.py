@@ -20,7 +20,7 @@ from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers import miniseed
 from daq.formats.readers.miniseed import MiniSeedPart
 from daq.formats.sources import Selection, open_sources, sensors_of_parts
-from daq.formats.traces import LoadedPart, PartCache, Trace, TracePart
+from daq.formats.traces import PartCache, ReadPart, Trace, TracePart
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
@@ -229,15 +229,12 @@ def test_channels_sampled_between_each_other_are_resampled() -> None:
     n = np.arange(4000)
     late = 0.37 / RATE
     off = RATE * (1 + 60e-6)
-    part = LoadedPart(
-        "memory",
-        [
-            Trace("S", "a", START, RATE, wave(n / RATE)),
-            Trace("S", "b", START + round(late * 1e9), RATE, wave(n / RATE + late)),
-            Trace("S", "c", START, off, wave(n / off), end_ns=START + round(3999e9 / off)),
-        ],
-    )
-    (sensor,) = sensors_of_parts([part])
+    traces = [
+        Trace("S", "a", START, RATE, wave(n / RATE)),
+        Trace("S", "b", START + round(late * 1e9), RATE, wave(n / RATE + late)),
+        Trace("S", "c", START, off, wave(n / off), end_ns=START + round(3999e9 / off)),
+    ]
+    (sensor,) = sensors_of_parts([ReadPart(Path("memory"), lambda _: traces)])
     (stretch,) = sensor.stretches
     assert (stretch.start_utc_ns - START) % STEP == 0
     rows = (np.arange(stretch.n_samples) * STEP + stretch.start_utc_ns - START) / 1e9
@@ -328,43 +325,30 @@ def test_parts_outside_of_the_span_are_not_loaded(
     assert 0 in loaded
 
 
-def test_a_cache_makes_room_for_what_is_read_together() -> None:
-    loads: list[TracePart] = []
+@pytest.mark.parametrize(("n_loads", "n_bytes"), [(8, 0), (4, 4 << 20)])
+def test_a_cache_makes_room_for_what_is_read_together(n_loads: int, n_bytes: int) -> None:
+    loads: list[str] = []
+    cache = PartCache(1 << 20)
+    cache.make_room(n_bytes)
+    for part in 2 * large_parts("abcd", 1 << 16, loads):
+        cache.traces(part)
+    assert len(loads) == n_loads
 
-    class Counted(LoadedPart):
-        def load(self) -> Sequence[Trace]:
-            loads.append(self)
-            return self.traces
 
-    parts = [Counted("", [Trace("S", c, START, RATE, np.zeros(1 << 16))]) for c in "abcd"]
-    for n_loads, n_bytes in ((8, 0), (4, 4 << 20)):
-        loads.clear()
-        cache = PartCache(1 << 20)
-        cache.make_room(n_bytes)
-        for part in (*parts, *parts):
-            cache.traces(part)
-        assert len(loads) == n_loads
+def large_parts(names: Sequence[str], n_samples: int, loads: list[str]) -> list[TracePart]:
+    """Return parts of so many samples, which note when they are loaded."""
+
+    def read(path: Path) -> list[Trace]:
+        loads.append(path.name)
+        return [Trace("S", "a", START, RATE, np.zeros(n_samples))]
+
+    return [ReadPart(Path(name), read) for name in names]
 
 
 def test_parts_that_were_read_are_dropped_again() -> None:
-    cache = PartCache(8 << 20)
-    loads: list[str] = []
-
-    class Large:
-        def __init__(self, source: str) -> None:
-            self.source = source
-
-        def load(self) -> list[Trace]:
-            loads.append(self.source)
-            return [Trace("S", "a", START, RATE, np.zeros(1 << 17))]
-
-        def reaches(self, start_ns: int | None, end_ns: int | None) -> bool:
-            return start_ns == end_ns
-
-        def split(self) -> list[TracePart]:
-            return []
-
-    large = [Large(str(number)) for number in range(40)]
+    cache, loads = PartCache(8 << 20), list[str]()
+    names = [str(number) for number in range(40)]
+    large = large_parts(names, 1 << 17, loads)
 
     def load_twice() -> None:
         for part in large:
@@ -372,7 +356,7 @@ def test_parts_that_were_read_are_dropped_again() -> None:
             cache.traces(part)
 
     assert peak_of(load_twice) < 10 << 20
-    assert loads == [part.source for part in large]
+    assert loads == names
 
 
 def test_long_arrays_are_written_in_bounded_memory(tmp_path: Path) -> None:
