@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daq.bench.channel import Channel
-from daq.bench.units import canonical
 from daq.caveats import NO_CAVEATS
 from daq.errors import ArrayError
 from daq.formats.foreign_sensor import NS_PER_S, ForeignSensor, Stretch, finite_stretches
@@ -364,21 +362,11 @@ def _duration(given: _Sensor) -> float:
 
 def _in_memory(given: _Sensor, unit: str | None, responses: Responses | None) -> SensorInMemory:
     foreign = given.foreign
-    own = foreign.calibrations or (None,) * len(foreign.channels)
-    units = foreign.units or (given.unit,) * len(foreign.channels)
-    channels = []
-    for name, calibration, own_unit in zip(foreign.channels, own, units, strict=True):
-        channel = Channel(name=name, sensitivity=1.0, unit=canonical(unit or own_unit or COUNTS))
-        if calibration is not None and not unit:
-            channel = Channel(
-                name=name, sensitivity=calibration.sensitivity, unit=canonical(calibration.unit)
-            )
-        known = responses and responses.of(foreign.name, name, foreign.dated_spans_ns())
+    channels = foreign.own_channels(unit or given.unit)
+    for number, channel in enumerate(channels if responses else ()):
+        known = responses and responses.of(foreign.name, channel.name, foreign.dated_spans_ns())
         if known:
-            channel = Channel(
-                name=name, sensitivity=known.sensitivity, unit=known.unit, response=known.shape
-            )
-        channels.append(channel)
+            channels[number] = known.applied_to(channel)
     return SensorInMemory(foreign, tuple(channels))
 
 

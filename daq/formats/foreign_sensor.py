@@ -10,7 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.bench.channel import check_name
+from daq.bench.channel import Channel, check_name
+from daq.bench.units import canonical
 from daq.errors import ImportFormatError
 from daq.protocols.block import CountsArray
 
@@ -130,6 +131,17 @@ class ForeignSensor:
                 found.append(np.array(absent, np.int64) + np.array([0, row, row]))
             row += stretch.n_samples
         return np.concatenate(found)
+
+    def own_channels(self, unit: str = "") -> list[Channel]:
+        """Return its channels as the file describes them, or with samples in `unit`, if given."""
+        units = self.units or ("counts",) * len(self.channels)
+        calibrations = self.calibrations or (None,) * len(self.channels)
+        return [
+            Channel(name=name, sensitivity=1.0, unit=canonical(unit or in_file))
+            if own is None or unit
+            else Channel(name=name, sensitivity=own.sensitivity, unit=canonical(own.unit))
+            for name, in_file, own in zip(self.channels, units, calibrations, strict=True)
+        ]
 
     def check(self) -> None:
         """Refuse what no recording can hold.

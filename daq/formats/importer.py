@@ -11,11 +11,11 @@ from functools import lru_cache
 from heapq import merge
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from daq.bench.channel import Channel, check_name
+from daq.bench.channel import check_name
 from daq.bench.loading import dump, parse
 from daq.bench.model import Bench, Sensor
 from daq.bench.option_fit import misfits
@@ -35,14 +35,16 @@ from daq.recording.file_format import SensorLayout
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from daq.bench.channel import Channel
     from daq.bench.estimate_settings import EstimateSettings
-    from daq.formats.foreign_sensor import ForeignSensor, Stretch
+    from daq.formats.foreign_sensor import ForeignSensor
     from daq.formats.response import Responses
     from daq.formats.traces import PartCache
 
 _ROWS_AT_ONCE = 16 * BLOCK_ROWS
 _NAMES_KEPT = 100
 _MAX_STATION_XML = 1 << 24
+Origin: TypeAlias = Literal["response", "bench", "file", "none"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,7 @@ class Taken:
     """
 
     channel: str
-    origin: Literal["response", "bench", "file", "none"]
+    origin: Origin
     sensitivity: float
     unit: str
     notes: tuple[str, ...] = ()
@@ -375,20 +377,14 @@ def _described(
     span: tuple[int, int] | None,
 ) -> Sensor:
     """Return a sensor as the recording's bench names it; what was taken is added to `taken`."""
-    units = [canonical(unit) for unit in foreign.units] or ["counts"] * len(foreign.channels)
-    calibrations = foreign.calibrations or (None,) * len(foreign.channels)
-    model = next((each.model for each in calibrations if each and each.model), "")
-    serial = next((each.serial_number for each in calibrations if each and each.serial_number), "")
-    channels, found = [], []
-    for name, unit, own in zip(foreign.channels, units, calibrations, strict=True):
-        channel = Channel(name=name, sensitivity=1.0, unit=unit)
-        said = Taken(name, "none" if unit == "counts" else "file", 1.0, unit)
-        if own is not None:
-            channel = Channel(name=name, sensitivity=own.sensitivity, unit=canonical(own.unit))
-            origin: Literal["file", "none"] = "none" if channel.unit == "counts" else "file"
-            said = Taken(name, origin, own.sensitivity, channel.unit, (own.origin,))
-        channels.append(channel)
-        found.append(said)
+    own = foreign.calibrations or (None,) * len(foreign.channels)
+    model = next((each.model for each in own if each and each.model), "")
+    serial = next((each.serial_number for each in own if each and each.serial_number), "")
+    channels = foreign.own_channels()
+    found = [
+        _taken(each, "none" if each.unit == "counts" else "file", [said.origin] if said else [])
+        for each, said in zip(channels, own, strict=True)
+    ]
     sensor = Sensor(
         name=foreign.name,
         model=model,
@@ -402,42 +398,33 @@ def _described(
         listed = bench.sensor(foreign.name)
         channels = list(_matched(foreign, listed))
         _refuse_scaling_twice(foreign, channels)
-        found = [Taken(each.name, "bench", each.sensitivity, each.unit) for each in channels]
+        found = [_taken(each, "bench") for each in channels]
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
     stretches = _within(foreign.dated_spans_ns(), span)
     for number, name in enumerate(foreign.channels):
         known = responses and responses.of(foreign.name, name, stretches)
         if not known:
             continue
-        if units[number] != "counts":
+        if foreign.units and (unit := canonical(foreign.units[number])) != "counts":
             raise ImportFormatError(
-                f"{foreign.source}: {foreign.name}.{name} is in {units[number]} already; expected"
+                f"{foreign.source}: {foreign.name}.{name} is in {unit} already; expected"
                 " no response, or samples in counts"
             )
-        changes: dict[str, Any] = {
-            "sensitivity": known.sensitivity,
-            "unit": known.unit,
-            "response": known.shape,
-        }
-        if known.azimuth is not None and known.dip is not None and not channels[number].direction:
+        channel = known.applied_to(channels[number])
+        if known.azimuth is not None and known.dip is not None and not channel.direction:
             direction = f"azimuth {known.azimuth:g}°, dip {known.dip:g}°"
-            changes["direction"] = direction
-        channels[number] = replace(channels[number], **changes)
-        found[number] = Taken(
-            channels[number].name,
-            "response",
-            known.sensitivity,
-            known.unit,
-            (*([known.model] if known.model else []), *known.notes, f"from {known.source}"),
-        )
-        sensor = sensor.model_copy(
-            update={
-                "model": sensor.model or known.model,
-                "serial_number": sensor.serial_number or known.serial_number,
-            }
-        )
+            channel = replace(channel, direction=direction)
+        channels[number] = channel
+        notes = [known.model] if known.model else []
+        found[number] = _taken(channel, "response", [*notes, *known.notes, f"from {known.source}"])
+        model, serial = sensor.model or known.model, sensor.serial_number or known.serial_number
+        sensor = sensor.model_copy(update={"model": model, "serial_number": serial})
     taken += [replace(each, channel=f"{foreign.name}.{each.channel}") for each in found]
     return sensor.model_copy(update={"channels": tuple(channels)})
+
+
+def _taken(channel: Channel, origin: Origin, notes: Sequence[str] = ()) -> Taken:
+    return Taken(channel.name, origin, channel.sensitivity, channel.unit, tuple(notes))
 
 
 def _within(
@@ -514,55 +501,31 @@ def _layout(described: Sensor, foreign: ForeignSensor) -> SensorLayout:
 def _write(writer: ArrayWriter, sensors: Sequence[ForeignSensor]) -> None:
     """Write sensors one after another; those that are in the same files together, by time."""
     for group in _sharing_files(sensors):
-        sequences = [_rows_to_write(sensor) for sensor in group]
-        for rows in merge(*sequences, key=lambda each: each.start_ns):
-            _write_rows(writer, rows)
+        for _ in merge(*(_written(writer, sensor) for sensor in group)):
+            pass
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """Rows of a stretch that are written at once, and the samples missing before them."""
-
-    sensor: ForeignSensor
-    stretch: Stretch
-    first_sample: int
-    first: int
-    end: int
-    start_ns: int
-    missing: int
-
-
-def _rows_to_write(sensor: ForeignSensor) -> Iterator[_Rows]:
-    expected = 0
-    for first_sample, stretch in zip(sensor.first_samples(), sensor.stretches, strict=True):
+def _written(writer: ArrayWriter, sensor: ForeignSensor) -> Iterator[int]:
+    """Write the next rows of a sensor after each yield: that of when they begin, UTC in ns."""
+    name, expected = sensor.name, 0
+    for begin, stretch in zip(sensor.first_samples(), sensor.stretches, strict=True):
         for first in range(0, stretch.n_samples, _ROWS_AT_ONCE):
             end = min(first + _ROWS_AT_ONCE, stretch.n_samples)
-            (start_ns,) = stretch.times_ns([first], sensor.sampling_rate)
-            missing = first_sample + first - expected
-            yield _Rows(sensor, stretch, first_sample + first, first, end, start_ns, missing)
-            expected = first_sample + end
-
-
-def _write_rows(writer: ArrayWriter, rows: _Rows) -> None:
-    sensor, stretch = rows.sensor, rows.stretch
-    if rows.missing:
-        writer.gap(
-            sensor.name,
-            rows.first_sample - rows.missing,
-            rows.missing,
-            reason=f"not in {sensor.source}",
-        )
-    edges = [*range(rows.first, rows.end, BLOCK_ROWS), rows.end]
-    times = stretch.times_ns(edges, sensor.sampling_rate)
-    after = [time - writer.created.utc_ns for time in times]
-    writer.samples(
-        sensor.name,
-        stretch.counts[rows.first : rows.end],
-        first_sample=rows.first_sample,
-        received_ns=after[1:],
-        utc_ns=after[:-1],
-        restart=rows.first == 0 and not stretch.continues,
-    )
+            edges = [*range(first, end, BLOCK_ROWS), end]
+            times = stretch.times_ns(edges, sensor.sampling_rate)
+            yield times[0]
+            if missing := begin + first - expected:
+                writer.gap(name, expected, missing, reason=f"not in {sensor.source}")
+            expected = begin + end
+            after = [time - writer.created.utc_ns for time in times]
+            writer.samples(
+                name,
+                stretch.counts[first:end],
+                first_sample=begin + first,
+                received_ns=after[1:],
+                utc_ns=after[:-1],
+                restart=first == 0 and not stretch.continues,
+            )
 
 
 def _sharing_files(sensors: Iterable[ForeignSensor]) -> list[list[ForeignSensor]]:

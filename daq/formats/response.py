@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from daq.bench.channel import Channel
 from daq.bench.response import (
     AnalogPolesZeros,
     DigitalPolesZeros,
@@ -104,6 +105,10 @@ class ChannelResponse:
     azimuth: float | None = field(default=None, compare=False)
     dip: float | None = field(default=None, compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
+
+    def applied_to(self, channel: Channel) -> Channel:
+        """Return a channel of counts with this response."""
+        return replace(channel, sensitivity=self.sensitivity, unit=self.unit, response=self.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
