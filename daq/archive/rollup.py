@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -279,16 +280,11 @@ def summaries(
         Of the noise; its first method counts.
     """
     estimator = Estimator(plan, settings, described.channels)
-    making: tuple[str, _Making] | None = None
-    for start, n_segments, csm in rows:
-        month = month_of(start)
-        if making is None or making[0] != month:
-            if making is not None:
-                yield making[0], making[1].made()
-            making = month, _Making(estimator, described)
-        making[1].take(start, n_segments, csm)
-    if making is not None:
-        yield making[0], making[1].made()
+    for month, some in groupby(rows, lambda row: month_of(row[0])):
+        making = _Making(estimator, described)
+        for row in some:
+            making.take(*row)
+        yield month, making.made()
 
 
 class _Making:
