@@ -294,15 +294,13 @@ def _set_faults(
     if n_named < needed:
         expected = f"expected at least {needed} for method {', '.join(estimate.methods)}"
         yield FileFault("sensors", expected, f"{n_named} sensor{'' if n_named == 1 else 's'}")
-    counts = Counter(sensor.n_main_channels for sensor in sensors)
+    counts = Counter(len(sensor.main) for sensor in sensors)
     if len(counts) > 1:
         usual = counts.most_common(1)[0][0]
         for sensor in sensors:
-            if sensor.n_main_channels != usual:
+            if len(sensor.main) != usual:
                 expected = f"expected {usual} that are not auxiliary, as in the other sensors"
-                yield FileFault(
-                    "channels", expected, f"{sensor.n_main_channels} channels", sensor.name
-                )
+                yield FileFault("channels", expected, f"{len(sensor.main)} channels", sensor.name)
 
 
 def _unit_faults(sensors: Sequence[Sensor], estimate: EstimateSettings) -> Iterator[FileFault]:
@@ -310,7 +308,7 @@ def _unit_faults(sensors: Sequence[Sensor], estimate: EstimateSettings) -> Itera
 
     A unit of velocity with the sensitivity for acceleration is a mistake that is easily made.
     """
-    channels = [(s.name, c.name, c.unit) for s in sensors for c in s.channels if not c.auxiliary]
+    channels = [(s.name, c.name, c.unit) for s in sensors for c in s.main.values()]
     quantities = [
         "motion" if estimate.unit and is_motion(unit) else (in_si(unit) or (1.0, unit))[1]
         for _, _, unit in channels

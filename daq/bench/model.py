@@ -137,16 +137,21 @@ TABLES: dict[type, type[BenchTable]] = {
 """The table of each plain class that is made of one."""
 
 
-def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
-    if value[0] >= value[1]:
-        raise ValueError("expected the lower frequency first, in Hz")
-    return value
+def _rising(expected: str) -> AfterValidator:
+    """Refuse numbers of which the second is not above the first."""
+
+    def check(value: tuple[float, ...]) -> tuple[float, ...]:
+        if value[0] >= value[1]:
+            raise ValueError(expected)
+        return value
+
+    return AfterValidator(check)
 
 
-def _range(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] >= value[1]:
-        raise ValueError("expected the lowest and the highest temperature in °C")
-    return value
+InBand = Annotated[
+    tuple[PositiveNumber, PositiveNumber, PositiveNumber],
+    _rising("expected the lower frequency first, in Hz"),
+]
 
 
 class DataSheet(BenchTable):
@@ -156,21 +161,20 @@ class DataSheet(BenchTable):
     """Of the values: that of the channel, if not given."""
     noise_density: tuple[tuple[PositiveNumber, PositiveNumber], ...] = ()
     """Pairs of a frequency in Hz and the noise there in unit/√Hz."""
-    integrated_noise: tuple[
-        Annotated[tuple[PositiveNumber, PositiveNumber, PositiveNumber], AfterValidator(_rising)],
-        ...,
-    ] = ()
+    integrated_noise: tuple[InBand, ...] = ()
     """From and to which frequency in Hz, and the noise between in unit rms."""
-    dynamic_range: tuple[
-        Annotated[tuple[PositiveNumber, PositiveNumber, PositiveNumber], AfterValidator(_rising)],
-        ...,
-    ] = ()
+    dynamic_range: tuple[InBand, ...] = ()
     """From and to which frequency in Hz, and in dB a sine of full scale above the noise between."""
     full_scale: PositiveNumber | None = None
     """Peak, in the unit."""
     channels: tuple[str, ...] = ()
     """Names of the channels it holds for; all, if empty."""
-    temperature: Annotated[tuple[Number, Number], AfterValidator(_range)] | None = None
+    temperature: (
+        Annotated[
+            tuple[Number, Number], _rising("expected the lowest and the highest temperature in °C")
+        ]
+        | None
+    ) = None
     """Lowest and highest of operation, in °C."""
     temperature_coefficient: PositiveNumber | None = None
     """Largest change of the sensitivity, as a fraction of it for each °C."""
@@ -217,9 +221,9 @@ class Sensor(BenchTable):
         return BenchFileError(FileFault(key, expected, value, self.name))
 
     @property
-    def n_main_channels(self) -> int:
-        """Number of channels that take part in the huddle test."""
-        return sum(not channel.auxiliary for channel in self.channels)
+    def main(self) -> dict[int, Channel]:
+        """Channels that take part in the huddle test, by their places."""
+        return {n: each for n, each in enumerate(self.channels) if not each.auxiliary}
 
 
 _ESTIMATE_FIELDS: dict[str, Any] = {
@@ -439,6 +443,11 @@ class Bench(BenchTable):
             if sensor.name == name:
                 return sensor
         raise KeyError(name)
+
+    @property
+    def channels(self) -> dict[tuple[str, str], Channel]:
+        """All channels, by the names of sensor and channel."""
+        return {(s.name, channel.name): channel for s in self.sensors for channel in s.channels}
 
     def ports(self) -> dict[str, tuple[Sensor, ...]]:
         """Return the sensors of each port, in the order of the file."""

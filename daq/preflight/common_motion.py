@@ -74,13 +74,12 @@ class RelativeResponses:
     @property
     def dims(self) -> tuple[int, ...]:
         """Number of channels of each sensor, without auxiliary ones."""
-        return tuple(each.sensor.n_main_channels for each in self.sensors)
+        return tuple(len(each.sensor.main) for each in self.sensors)
 
 
 def main_samples(each: SensorPreview) -> NDArray[np.float64]:
     """Return the samples of the channels that take part, shape (n_samples, n_channels)."""
-    main = [n for n, channel in enumerate(each.sensor.channels) if not channel.auxiliary]
-    return np.asarray(each.samples[:, main])
+    return np.asarray(each.samples[:, list(each.sensor.main)])
 
 
 def _aligned(sensors: Sequence[SensorPreview]) -> list[NDArray[np.float64]]:
@@ -104,7 +103,7 @@ def _response(
 
     One or two others are the witnesses: few segments do not tell many channels apart.
     """
-    counts = [each.sensor.n_main_channels for each in sensors]
+    counts = [len(each.sensor.main) for each in sensors]
     d = counts[first]
     if counts[second] != d:
         return None
@@ -137,7 +136,7 @@ def to_acceleration(sensor: Sensor, frequency: FloatArray) -> ComplexArray:
 
     Shape (n_freqs, n_channels). Spectra that are of no motion stay in their unit.
     """
-    units = [channel.unit for channel in sensor.channels if not channel.auxiliary]
+    units = [channel.unit for channel in sensor.main.values()]
     return np.stack(
         [conversion(unit, "m/s²" if is_motion(unit) else unit, frequency) for unit in units], axis=1
     )

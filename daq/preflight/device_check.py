@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.bench.model import Bench, Sensor
 from daq.devices.epson import commands
@@ -406,13 +405,13 @@ def _check(
     sensor: Sensor, information: DeviceInformation, blocks: Sequence[Block], events: Sequence[Event]
 ) -> SensorCheck:
     counts = np.concatenate([block.counts for block in blocks]).astype(np.float64)
-    instants = _concatenated([block.instants_ns for block in blocks])
+    known = [block.instants_ns for block in blocks if block.instants_ns is not None]
     jitter = bandwidth = None
-    if instants is not None and instants.size > 2:
-        steps = np.diff(instants) * 1e-9
-        grid = np.polynomial.Polynomial.fit(np.arange(instants.size), instants * 1e-9, 1)
-        jitter = float(np.std(instants * 1e-9 - grid(np.arange(instants.size))))
-        bandwidth = float(0.5 / steps.max())
+    if len(instants := np.concatenate([np.empty(0, np.int64), *known])) > 2:
+        places = np.arange(len(instants))
+        grid = np.polynomial.Polynomial.fit(places, instants * 1e-9, 1)
+        jitter = float(np.std(instants * 1e-9 - grid(places)))
+        bandwidth = float(0.5 / (np.diff(instants) * 1e-9).max())
     return SensorCheck(
         information=information,
         n_samples=len(counts),
@@ -439,8 +438,3 @@ def _check(
         jitter=jitter,
         bandwidth=bandwidth,
     )
-
-
-def _concatenated(parts: Sequence[NDArray[np.int64] | None]) -> NDArray[np.int64] | None:
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known) if known else None

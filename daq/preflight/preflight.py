@@ -59,11 +59,7 @@ def gravity(each: SensorPreview) -> Iterator[CheckFinding]:
     """Yield an offset, and a vertical channel that does not feel gravity where another one does."""
     channels, means = each.sensor.channels, each.samples.mean(axis=0)
     factors = [in_acceleration(channel.unit) for channel in channels]
-    main = [
-        n
-        for n, channel in enumerate(channels)
-        if not channel.auxiliary and factors[n] is not None and np.ptp(each.samples[:, n]) > 0
-    ]
+    main = [n for n in _moving(each) if factors[n] is not None]
     if not main or each.is_clipping:
         return
     felt = np.array([means[n] * (factors[n] or 0.0) for n in main])
@@ -79,6 +75,11 @@ def gravity(each: SensorPreview) -> Iterator[CheckFinding]:
     if is_whole and most > MIN_OFFSET and is_elsewhere:
         both = f"{channels[up[0]].name} and {channels[strongest].name}"
         yield CheckFinding(Problem.SWAPPED, each.sensor.name, both)
+
+
+def _moving(each: SensorPreview) -> list[int]:
+    """Return the places of the channels that take part and are not dead."""
+    return [n for n in each.sensor.main if np.ptp(each.samples[:, n]) > 0]
 
 
 def _is_vertical(channel: Channel) -> bool:
@@ -185,7 +186,7 @@ def _what_is_reflected(each: SensorPreview, seen: Sequence[NDArray[np.float64]])
     That is what is seen where the sensors point alike. Where they do not, only the reflection is.
     """
     name = each.sensor.name
-    names = [channel.name for channel in each.sensor.channels if not channel.auxiliary]
+    names = [channel.name for channel in each.sensor.main.values()]
     d = len(names)
     for a, b in itertools.combinations(range(d), 2):
         order = list(range(d))
@@ -206,11 +207,7 @@ def _slow(each: SensorPreview, end_ns: int) -> NDArray[np.float64]:
     same moments.
     """
     per_row = each.sensor.sampling_rate / (2 * SLOW)
-    main = [
-        n
-        for n, channel in enumerate(each.sensor.channels)
-        if not channel.auxiliary and np.ptp(each.samples[:, n]) > 0
-    ]
+    main = _moving(each)
     values = each.samples[:, main]
     end = len(values) - max(0.0, (each.last_ns - end_ns) * 1e-9 * each.sensor.sampling_rate)
     edges = end - per_row * np.arange(int(end / per_row), -1, -1)
@@ -351,14 +348,9 @@ def _together(
     found: Sequence[CheckFinding], sensors: Sequence[SensorPreview]
 ) -> Iterator[CheckFinding]:
     """Yield findings, those of all channels of a sensor as one: one cause, one row."""
+    channels = {e.sensor.name: [c.name for c in e.sensor.main.values()] for e in sensors}
     for each in found:
-        main = [
-            channel.name
-            for preview in sensors
-            if preview.sensor.name == each.sensor
-            for channel in preview.sensor.channels
-            if not channel.auxiliary
-        ]
+        main = channels.get(each.sensor, [])
         alike = [
             one
             for one in found
@@ -460,8 +452,8 @@ def _clock(each: SensorPreview) -> Iterator[CheckFinding]:
 
 
 def _dead(each: SensorPreview) -> Iterator[CheckFinding]:
-    for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
-        if not channel.auxiliary and np.ptp(values) == 0:
+    for n, channel in each.sensor.main.items():
+        if np.ptp(each.samples[:, n]) == 0:
             yield CheckFinding(Problem.DEAD, each.sensor.name, channel.name)
 
 
@@ -486,10 +478,8 @@ def _levels(each: SensorPreview) -> Iterator[CheckFinding]:
     if counts is None and (sheet is None or sheet.full_scale is None):
         yield _of(Problem.NO_FULL_SCALE, each)
         return
-    for channel, values in zip(each.sensor.channels, each.samples.T, strict=True):
-        if channel.auxiliary:
-            continue
-        most = float(np.abs(values).max())
+    for n, channel in each.sensor.main.items():
+        most = float(np.abs(each.samples[:, n]).max())
         share = most * abs(channel.sensitivity) / (counts or math.inf)
         has_sheet = sheet is not None and (not sheet.channels or channel.name in sheet.channels)
         if sheet is not None and has_sheet and sheet.full_scale:
@@ -514,11 +504,11 @@ def _hum(able: Sequence[SensorPreview]) -> Iterator[CheckFinding]:
         for n, each in enumerate(known):
             others = totals[:n] + totals[n + 1 :]
             power, share = spectra[n]
-            main = [channel.name for channel in each.sensor.channels if not channel.auxiliary]
+            main = list(each.sensor.main.values())
             for place in np.flatnonzero(share > HUM_SHARE).tolist():
                 is_more = bool(others) and power[place] > HUM_RATIO * float(np.median(others))
                 problem = Problem.HUM if is_more else Problem.COMMON_HUM
-                yield CheckFinding(problem, each.sensor.name, main[place], value=mains)
+                yield CheckFinding(problem, each.sensor.name, main[place].name, value=mains)
 
 
 def _at_mains(each: SensorPreview, mains: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -549,8 +539,7 @@ def _sensitivities(motion: RelativeResponses) -> Iterator[CheckFinding]:
     names = [
         (each.sensor.name, channel.name)
         for each in motion.sensors
-        for channel in each.sensor.channels
-        if not channel.auxiliary
+        for channel in each.sensor.main.values()
     ]
     for gain in wrong_gains(motion.responses, motion.dims):
         sensor, channel = names[gain.channel]

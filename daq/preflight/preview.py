@@ -169,8 +169,7 @@ class SensorPreview:
         is_polled = len(instants) == len(blocks)
         if is_polled:
             counts = _even(np.concatenate(instants), counts, sensor.sampling_rate)
-        main = [n for n, channel in enumerate(sensor.channels) if not channel.auxiliary]
-        limits = CountLimits.of(raw, {n: np.ones(len(raw), bool) for n in main})
+        limits = CountLimits.of(raw, {n: np.ones(len(raw), bool) for n in sensor.main})
         return cls(
             sensor,
             information,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +23,7 @@ from estimator.self_noise.coherency import coherency, other_channels, own_channe
 from estimator.spectra.windows import get_window
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daq.bench.channel import Certificate, Channel
     from daq.bench.model import Bench
@@ -106,20 +107,13 @@ def calibrate(
     snapshot = estimate.snapshot
     if not 0 < confidence < 1:
         raise WrongSettingError(f"confidence {confidence:g}: expected a fraction such as 0.95")
-    names = snapshot.sensor_names
-    certified = [_certificates_of(snapshot, bench, name) for name in names]
+    names, known = snapshot.sensor_names, {} if bench is None else bench.channels
+    certified = [_certificates_of(snapshot, known, name) for name in names]
     if reference is not None and reference not in names:
         raise WrongSettingError(f"reference {reference!r}: expected one of {', '.join(names)}")
     chosen = next((n for n, each in enumerate(certified) if each), 0)
     chosen = chosen if reference is None else names.index(reference)
-    certificates = certified[chosen]
-    work = _Work(
-        estimate,
-        bench,
-        reference=chosen,
-        certificates=certificates,
-        confidence=confidence,
-    )
+    work = _Work(estimate, known, chosen, certified[chosen], confidence)
     sensors: list[SensorCalibration] = []
     curves: list[ResponseCurve] = []
     budgets: list[Budget] = []
@@ -150,7 +144,7 @@ def calibrate(
     noise, without_noise = work.noise(sensors, budgets)
     return Calibration(
         reference=chosen,
-        certificates=certificates,
+        certificates=certified[chosen],
         sensors=tuple(sensors),
         curves=tuple(curves),
         budgets=(*budgets, *noise),
@@ -166,42 +160,27 @@ class _Work:
     def __init__(
         self,
         estimate: Estimate,
-        bench: Bench | None,
-        *,
+        known: Mapping[tuple[str, str], Channel],
         reference: int,
         certificates: Sequence[Certificate],
         confidence: float,
     ) -> None:
         snapshot = estimate.snapshot
-        self.snapshot, self._estimate, self._bench = snapshot, estimate, bench
+        self.snapshot, self._estimate, self._known = snapshot, estimate, known
         self._reference, self._confidence = reference, confidence
-        name = snapshot.sensor_names[reference]
         self._certificates = certificates
         self.band = estimate.band
-        self._first = np.cumsum([0, *snapshot.dims])
-        scale = np.ones(len(snapshot.channels))
-        own = [label for label in snapshot.channels if label.sensor == name]
-        stated = [snapshot.sensitivities.get((each.sensor, each.channel)) for each in own]
-        # conservative: as if the sensitivities of all its channels erred together
-        self._of_reference = max(
-            (
-                math.hypot(0.0 if certificates else each.own, each.by_temperature)
-                for each in stated
-                if each
-            ),
-            default=0.0,
-        )
+        self._scale = scale = np.ones(len(snapshot.channels))
         of_certificates = 0.0
-        for number, certificate in enumerate(certificates):
-            column = int(self._first[reference]) + number
-            label = snapshot.channels[column]
-            channel = _channel_of(bench, label.sensor, label.channel)
-            if channel is not None:  # motion by the certificate, not by the bench file
-                scale[column] = channel.sensitivity / certificate.value
+        for column, certificate in zip(self._columns(reference), certificates, strict=False):
+            # motion by the certificate, not by the bench file
+            scale[column] = known[self._key(column)].sensitivity / certificate.value
             relative = certificate.expanded_uncertainty / certificate.k / abs(certificate.value)
             of_certificates = max(of_certificates, relative)
-        self._of_reference = math.hypot(self._of_reference, of_certificates)
-        self._scale = scale
+        # conservative: as if the sensitivities of all its channels erred together
+        stated = [snapshot.sensitivities.get(self._key(n)) for n in self._columns(reference)]
+        own = [math.hypot(0.0 if certificates else e.own, e.by_temperature) for e in stated if e]
+        self._of_reference = math.hypot(max(own, default=0.0), of_certificates)
         self._csm: ComplexArray = snapshot.csm * scale[:, None] * scale[None, :]
         self.motion = CommonMotion(
             self._csm,
@@ -214,13 +193,15 @@ class _Work:
         )
         self._bending = self._curvature()
 
+    def _columns(self, sensor: int) -> range:
+        return own_channels(self.snapshot.dims, sensor)
+
+    def _key(self, column: int) -> tuple[str, str]:
+        return self.snapshot.channels[column].sensor, self.snapshot.channels[column].channel
+
     def octaves(self) -> list[tuple[float, float]]:
-        edges = self.edges(BANDS_PER_OCTAVE)
-        return (
-            list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
-            if len(edges) > 2
-            else []
-        )
+        edges = self.edges(BANDS_PER_OCTAVE).tolist()
+        return list(pairwise(edges)) if len(edges) > 2 else []
 
     def edges(self, per_octave: int) -> FloatArray:
         low, high = self.band
@@ -246,7 +227,7 @@ class _Work:
             bending[1:-1] = factor / 2 * second / ratio[1:-1]
         known_slopes = np.where(np.isfinite(slopes), slopes, 0.0)
         for sensor in range(len(dims)):
-            own = list(own_channels(dims, sensor))
+            own = list(self._columns(sensor))
             rest = other_channels(dims, sensor, reference)
             count = np.isfinite(slopes[:, rest]).sum(axis=1)
             mean = known_slopes[:, rest].sum(axis=1) / np.maximum(count, 1)
@@ -255,7 +236,7 @@ class _Work:
 
     def sensitivities(self, found: SensorCalibration) -> list[Budget]:
         """Return a budget for each channel of a sensor."""
-        labels, f = self.snapshot.channels, self.snapshot.frequency
+        f = self.snapshot.frequency
         inside = (f >= found.low) & (f <= found.high)
         omega_squared = float(np.mean((2 * np.pi * f[inside]) ** 2))
         residual = self.snapshot.diagnostics.synchronisation.residual
@@ -263,47 +244,37 @@ class _Work:
         jitter = math.hypot(
             *(known(residual.get(names[each], 0.0)) for each in (found.sensor, found.reference))
         )
+        variation, n = math.sqrt(max(found.excess**2 - 1, 0.0)), max(found.n_frequencies - 1, 1)
+        clocks = omega_squared * jitter**2 / 2 / _RECTANGULAR
         budgets = []
-        for number in range(self.snapshot.dims[found.sensor]):
-            column = int(self._first[found.sensor]) + number
-            label = labels[column]
-            channel = _channel_of(self._bench, label.sensor, label.channel)
+        for number, column in enumerate(self._columns(found.sensor)):
+            sensor, name = self._key(column)
+            channel = self._known.get((sensor, name))
             gain = float(found.gain.value[number])
             scatter = float(found.gain.error[number]) / gain
             bent = self._bending[inside, column]
             bent = bent[np.isfinite(bent)]
+            leakage = float(abs(np.mean(bent.real))) / _RECTANGULAR if bent.size else 0.0
             components = [
                 Component("estimate", "A", "normal", scatter, found.dof),
-                Component(
-                    "variation",
-                    "A",
-                    "normal",
-                    scatter * math.sqrt(max(found.excess**2 - 1, 0.0)),
-                    float(max(found.n_frequencies - 1, 1)),
-                ),
-                Component(
-                    "clocks", "B", "rectangular", omega_squared * jitter**2 / 2 / _RECTANGULAR
-                ),
-                Component(
-                    "leakage",
-                    "B",
-                    "rectangular",
-                    float(abs(np.mean(bent.real))) / _RECTANGULAR if bent.size else 0.0,
-                ),
+                Component("variation", "A", "normal", scatter * variation, float(n)),
+                Component("clocks", "B", "rectangular", clocks),
+                Component("leakage", "B", "rectangular", leakage),
                 Component("quantisation", "B", "rectangular", self._counting(column, inside)),
             ]
-            if drift := self._drift(column, found.reference):
-                components.append(Component("drift", "B", "normal", drift))
-            if bent_by := self._nonlinearity(column, found.reference, inside):
-                components.append(Component("linearity", "B", "normal", bent_by))
+            further = {
+                "drift": self._drift(column),
+                "linearity": self._nonlinearity(column, inside),
+                "certificate" if self._certificates else "tolerance": self._of_reference,
+            }
+            components += [
+                Component(source, "B", "normal", size) for source, size in further.items() if size
+            ]
             absolute = bool(self._certificates) and channel is not None
-            if self._of_reference:
-                source = "certificate" if self._certificates else "tolerance"
-                components.append(Component(source, "B", "normal", self._of_reference))
             budgets.append(
                 Budget(
-                    sensor=label.sensor,
-                    channel=label.channel,
+                    sensor=sensor,
+                    channel=name,
                     quantity="sensitivity",
                     low=found.low,
                     high=found.high,
@@ -315,33 +286,27 @@ class _Work:
             )
         return budgets
 
-    def _drift(self, column: int, reference: int) -> float:
+    def _drift(self, column: int) -> float:
         """Return the standard deviation of a gain over the recording, where responses change."""
         found = self.snapshot.diagnostics.diagnosis
         if found is None or found.stability is None:
             return 0.0
-        of_reference = slice(
-            int(self._first[reference]),
-            int(self._first[reference]) + self.snapshot.dims[reference],
-        )
         added = found.stability.added
-        return float(np.sqrt(added[column] + added[of_reference].max()))
+        return float(np.sqrt(added[column] + added[list(self._columns(self._reference))].max()))
 
-    def _nonlinearity(self, column: int, reference: int, inside: np.ndarray) -> float:
+    def _nonlinearity(self, column: int, inside: np.ndarray) -> float:
         """Return by how much a gain at this loudness may differ from that at another.
 
         A cube ``c x**3`` adds ``3 c s**2`` to the gain, with s the standard deviation, and noise of
         ``6 c**2 s**6``: two thirds of the square of what it adds to the gain, of the motion. A
         square adds about as much at an offset of s.
         """
-        first = int(self._first[reference])
-        of_reference = range(first, first + self.snapshot.dims[reference])
         psd = self.snapshot.data_psd[inside]
         squares = {
             each.column: 1.5 * float(each.explained[inside].sum() / psd[:, each.column].sum())
             for each in self.snapshot.nonlinear
         }
-        most = max((squares.get(each, 0.0) for each in of_reference), default=0.0)
+        most = max(squares.get(each, 0.0) for each in self._columns(self._reference))
         return math.sqrt(squares.get(column, 0.0) + most)
 
     def _counting(self, column: int, inside: np.ndarray) -> float:
@@ -360,19 +325,16 @@ class _Work:
         self, sensors: Sequence[SensorCalibration], sensitivities: Sequence[Budget]
     ) -> tuple[list[Budget], list[ChannelLabel]]:
         """Return budgets of the noise over the whole band, and the channels without noise."""
-        combined: dict[tuple[str, str], float] = {}
-        for each in reversed(sensitivities):
-            combined[each.sensor, each.channel] = each.combined
-        first, labels = int(self._first[self._reference]), self.snapshot.channels
+        combined = {(each.sensor, each.channel): each.combined for each in reversed(sensitivities)}
         calibrated = {
-            first + number: (1 / float(self._scale[first + number]), self._of_reference)
-            for number in range(self.snapshot.dims[self._reference])
+            column: (1 / float(self._scale[column]), self._of_reference)
+            for column in self._columns(self._reference)
         }
         for found in sensors:
-            for number, gain in enumerate(found.gain.value.tolist()):
-                column = int(self._first[found.sensor]) + number
-                label = labels[column]
-                calibrated[column] = (gain, combined[label.sensor, label.channel])
+            for column, gain in zip(
+                self._columns(found.sensor), found.gain.value.tolist(), strict=True
+            ):
+                calibrated[column] = gain, combined[self._key(column)]
         return calibrated_budgets(
             self._estimate,
             self.band,
@@ -382,26 +344,10 @@ class _Work:
         )
 
 
-def _certificates_of(snapshot: Snapshot, bench: Bench | None, name: str) -> tuple[Certificate, ...]:
+def _certificates_of(
+    snapshot: Snapshot, known: Mapping[tuple[str, str], Channel], name: str
+) -> tuple[Certificate, ...]:
     """Return the certificates of a sensor, in the order of its channels; empty if one has none."""
-    channels = [
-        _channel_of(bench, name, each.channel) for each in snapshot.channels if each.sensor == name
-    ]
-    found = tuple(
-        each.certificate for each in channels if each is not None and each.certificate is not None
-    )
+    channels = [known.get((name, e.channel)) for e in snapshot.channels if e.sensor == name]
+    found = tuple(each.certificate for each in channels if each and each.certificate)
     return found if len(found) == len(channels) else ()
-
-
-def _channel_of(bench: Bench | None, sensor: str, channel: str) -> Channel | None:
-    """Return a channel of the bench file by its name; None if there is none."""
-    return next(
-        (
-            found
-            for each in (() if bench is None else bench.sensors)
-            if each.name == sensor
-            for found in each.channels
-            if found.name == channel
-        ),
-        None,
-    )

@@ -186,16 +186,14 @@ def quantisation_shares(estimate: Estimate) -> list[tuple[float, float]]:
 
 
 def _data_sheet(bench: Bench | None, label: ChannelLabel) -> DataSheet | None:
-    sensor = (
-        None if bench is None else next((s for s in bench.sensors if s.name == label.sensor), None)
-    )
-    sheet = None if sensor is None else sensor.data_sheet
-    if sensor is None or sheet is None or (sheet.channels and label.channel not in sheet.channels):
+    key = label.sensor, label.channel
+    sheets = {} if bench is None else {each.name: each.data_sheet for each in bench.sensors}
+    sheet = sheets.get(label.sensor)
+    if bench is None or sheet is None or (sheet.channels and label.channel not in sheet.channels):
         return None
-    if sheet.unit is not None:
+    if sheet.unit is not None or key not in bench.channels:
         return sheet
-    unit = next((c.unit for c in sensor.channels if c.name == label.channel), label.unit)
-    return sheet.model_copy(update={"unit": unit})
+    return sheet.model_copy(update={"unit": bench.channels[key].unit})
 
 
 def _with_factor(

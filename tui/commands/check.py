@@ -254,7 +254,7 @@ def _sensor_table(device: DiscoveredDevice) -> str:
 def _summary(bench: Bench) -> str:
     estimate = bench.estimate
     sensors = ", ".join(
-        f"{sensor.name} ({sensor.n_main_channels} channels at {sensor.sampling_rate:g} Hz)"
+        f"{sensor.name} ({len(sensor.main)} channels at {sensor.sampling_rate:g} Hz)"
         for sensor in bench.sensors
     )
     return (

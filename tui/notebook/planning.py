@@ -342,7 +342,7 @@ def plan_bench(path: Path, *, snr: float, cov: float) -> RecordingPlan:
     """Return the plan of a bench file; orientations come from its simulation table."""
     bench = load(path)
     settings = Settings.of(bench)
-    dims = tuple(sensor.n_main_channels for sensor in bench.sensors)
+    dims = tuple(len(sensor.main) for sensor in bench.sensors)
     return _planned(
         _directions(bench),
         dims,
@@ -525,8 +525,8 @@ def _directions(bench: Bench) -> FloatArray:
     if bench.has_scenario:
         scenario = scenario_of(bench)
         return np.vstack([scenario.directions(sensor.name) for sensor in bench.sensors])
-    most = max(sensor.n_main_channels for sensor in bench.sensors)
-    return np.vstack([np.eye(most)[: sensor.n_main_channels] for sensor in bench.sensors])
+    most = max(len(sensor.main) for sensor in bench.sensors)
+    return np.vstack([np.eye(most)[: len(sensor.main)] for sensor in bench.sensors])
 
 
 def _worst(values: FloatArray) -> float:

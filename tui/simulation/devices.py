@@ -61,10 +61,10 @@ def scenario_of(bench: Bench) -> Scenario:
             expected = f"is {rate:g} Hz; expected {sensor.sampling_rate:g} Hz, as of the sensor"
             fault = FileFault(f"simulation.sensors.{sensor.name}.sampling_rate", expected)
             raise BenchFileError(fault, source=source)
-        if scenario.n_channels(sensor.name) != sensor.n_main_channels:
+        if scenario.n_channels(sensor.name) != len(sensor.main):
             expected = (
                 f"has {scenario.n_channels(sensor.name)} channels; expected"
-                f" {sensor.n_main_channels}, one for each channel that is not auxiliary"
+                f" {len(sensor.main)}, one for each channel that is not auxiliary"
             )
             fault = FileFault(f"simulation.sensors.{sensor.name}", expected)
             raise BenchFileError(fault, source=source)
@@ -187,9 +187,7 @@ def with_faults(bench: Bench, path: Path) -> Bench:
 def _check_faults(bench: Bench, script: object, source: str) -> None:
     """Check that a fault script is valid for the bench."""
     try:
-        check(
-            parse_faults(script), {sensor.name: sensor.n_main_channels for sensor in bench.sensors}
-        )
+        check(parse_faults(script), {sensor.name: len(sensor.main) for sensor in bench.sensors})
     except ScenarioError as error:
         found = (FileFault("", problem) for problem in error.problems)
         raise BenchFileError(*found, source=source) from error

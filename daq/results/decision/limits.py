@@ -160,15 +160,8 @@ def mask_psd(bench: Bench, limit: Limit, label: ChannelLabel, frequency: FloatAr
     """
     mask = limit.mask
     inside = np.clip(frequency, mask.frequency[0], mask.frequency[-1])
-    return mask.at(inside, label.unit, of_channel=_unit_in_file(bench, label))
-
-
-def _unit_in_file(bench: Bench, label: ChannelLabel) -> str | None:
-    for sensor in bench.sensors:
-        for channel in sensor.channels:
-            if (sensor.name, channel.name) == (label.sensor, label.channel):
-                return channel.unit
-    return None
+    in_file = bench.channels.get((label.sensor, label.channel))
+    return mask.at(inside, label.unit, of_channel=None if in_file is None else in_file.unit)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
