@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
+from daq.bench.channel import Channel
 from daq.bench.durations import format_duration
 from daq.bench.estimate_settings import EstimateSettings
 from daq.bench.option_values import expected_of
@@ -17,20 +18,20 @@ LEAST_OF_A_PAIR = 3
 """Sensors among which two may share noise."""
 
 
-class _Channel(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def auxiliary(self) -> bool: ...
+class SampledSensor(Protocol):
+    """A sensor of a bench or a recording."""
 
+    @property
+    def name(self) -> str:
+        """Name of the sensor."""
 
-class _Sensor(Protocol):
     @property
-    def name(self) -> str: ...
+    def sampling_rate(self) -> float:
+        """Sampling rate in hertz."""
+
     @property
-    def sampling_rate(self) -> float: ...
-    @property
-    def channels(self) -> Sequence[_Channel]: ...
+    def channels(self) -> Sequence[Channel]:
+        """Channels of the sensor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Misfit:
     expected: str
 
 
-def misfits(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> Iterator[Misfit]:
+def misfits(settings: EstimateSettings, sensors: Sequence[SampledSensor]) -> Iterator[Misfit]:
     """Yield the options that do not fit the sensors."""
     channels = [
         f"{sensor.name}.{channel.name}"
@@ -90,7 +91,9 @@ def max_dimension(n_channels: int) -> int:
     return math.floor(n_channels - math.sqrt(n_channels) + 1e-12)
 
 
-def shortest_duration(settings: EstimateSettings, sensors: Sequence[_Sensor]) -> tuple[int, float]:
+def shortest_duration(
+    settings: EstimateSettings, sensors: Sequence[SampledSensor]
+) -> tuple[int, float]:
     """Return the minimum number of segments of an estimate, and their duration in seconds.
 
     An estimate needs more averages than a sensor has channels.

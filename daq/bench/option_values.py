@@ -22,31 +22,11 @@ CLOCKS = ("refined", "arrivals", "nominal")
 EQUALISATIONS = ("auto", "known", "estimated", "off")
 TRENDS = ("none", "constant", "linear")
 WINDOWS = (
-    "rectangular",
-    "boxcar",
-    "bartlett",
-    "barthann",
-    "blackman",
-    "blackmanharris",
-    "bohman",
-    "cosine",
-    "flattop",
-    "hamming",
-    "hann",
-    "lanczos",
-    "nuttall",
-    "parzen",
-    "taylor",
-    "triang",
+    *("rectangular", "boxcar", "bartlett", "barthann", "blackman", "blackmanharris", "bohman"),
+    *("cosine", "flattop", "hamming", "hann", "lanczos", "nuttall", "parzen", "taylor", "triang"),
 )
 PARAMETRIC_WINDOWS = (
-    "chebwin",
-    "dpss",
-    "exponential",
-    "gaussian",
-    "general_hamming",
-    "kaiser",
-    "tukey",
+    *("chebwin", "dpss", "exponential", "gaussian", "general_hamming", "kaiser", "tukey"),
 )
 """Of one parameter each, as in ``kaiser,8``."""
 _MAX_DIMENSION = 999
@@ -70,25 +50,22 @@ def to_number(text: str) -> float:
 
 def share(value: object) -> float:
     """Return a fraction from 0 to less than 1."""
-    found = number(value)
-    if 0 <= found < 1:
-        return found
+    if 0 <= number(value) < 1:
+        return number(value)
     raise ValueError("expected a fraction from 0 to less than 1")
 
 
 def cov(value: object) -> float:
     """Return a number between 0 and 1."""
-    found = number(value)
-    if 0 < found < 1:
-        return found
+    if 0 < number(value) < 1:
+        return number(value)
     raise ValueError("expected a number between 0 and 1, such as 0.05")
 
 
 def not_negative(value: object) -> float:
     """Return a number from 0."""
-    found = number(value)
-    if found >= 0:
-        return found
+    if number(value) >= 0:
+        return number(value)
     raise ValueError("expected a number from 0")
 
 
@@ -220,18 +197,8 @@ def stretches(value: object) -> tuple[str, ...]:
 
 def to_gains(texts: Sequence[str]) -> dict[str, float]:
     """Return the gains in texts such as B=1.02."""
-    found: dict[str, float] = {}
-    for text in texts:
-        name, _, number = text.rpartition("=")
-        if not name:
-            raise ValueError("expected a sensor and a number as in B=1.02")
-        if name in found:
-            raise ValueError(f"{name} is given twice; expected it once")
-        try:
-            found[name] = float(number)
-        except ValueError:
-            raise ValueError("expected a sensor and a number as in B=1.02") from None
-    return found
+    found = _by_name(texts, 1, "expected a sensor and a number as in B=1.02")
+    return {name: gain for name, (gain,) in found.items()}
 
 
 def axis_tolerance(value: object) -> dict[str, float]:
@@ -264,18 +231,22 @@ def lean(value: object) -> dict[str, tuple[float, float]]:
 
 def to_lean(texts: Sequence[str]) -> dict[str, list[float]]:
     """Return the angles in texts such as B=0.3,-0.1."""
+    return _by_name(texts, 2, "expected a sensor and two angles as in B=0.3,-0.1")
+
+
+def _by_name(texts: Sequence[str], n: int, expected: str) -> dict[str, list[float]]:
+    """Return the `n` numbers of each name, of texts such as B=0.3,-0.1."""
     found: dict[str, list[float]] = {}
     for text in texts:
-        name, _, angles = text.rpartition("=")
-        try:
-            numbers = [float(each) for each in angles.split(",")]
-        except ValueError:
-            numbers = []
-        if not name or len(numbers) != 2:
-            raise ValueError("expected a sensor and two angles as in B=0.3,-0.1")
+        name, _, numbers = text.rpartition("=")
         if name in found:
             raise ValueError(f"{name} is given twice; expected it once")
-        found[name] = numbers
+        try:
+            found[name] = [float(each) for each in numbers.split(",")]
+        except ValueError:
+            raise ValueError(expected) from None
+        if not name or len(found[name]) != n:
+            raise ValueError(expected)
     return found
 
 

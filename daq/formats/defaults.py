@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daq.bench.channel import Channel
+    from daq.bench.option_fit import SampledSensor
     from daq.bench.response import PolesZeros, Response
 
 PERIODS = 10
@@ -31,15 +32,8 @@ _LOWEST, _POINTS = 1e-4, 4001
 _ACCELERATION = 2
 
 
-class _Sensor(Protocol):
-    @property
-    def sampling_rate(self) -> float: ...
-    @property
-    def channels(self) -> Sequence[Channel]: ...
-
-
 def from_files(
-    sensors: Sequence[_Sensor], seconds: float
+    sensors: Sequence[SampledSensor], seconds: float
 ) -> tuple[EstimateSettings, dict[str, str]]:
     """Return the settings that fit sensors of foreign files, and the reason of each chosen one.
 

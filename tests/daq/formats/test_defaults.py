@@ -19,6 +19,8 @@ HOUR = 3600.0
 class Sensor:
     """A sensor as `from_files` reads it."""
 
+    name = "S"
+
     sampling_rate: float
     channels: tuple[Channel, ...]
 
