@@ -37,39 +37,20 @@ PRIVATE_TABLES = ("hooks", "metrics", "signing", "web")
 NO_COUNTER = -1
 """``device_counter`` of a block without one."""
 
+_RECEIVED = [("monotonic_ns", "<i8"), ("utc_ns", "<i8")]
+_SAID = [*_RECEIVED, ("sensor", "S64")]
 BLOCK_DTYPE = np.dtype(
     [
-        ("first_sample", "<i8"),
-        ("first_row", "<i8"),
-        ("n_samples", "<i8"),
-        ("monotonic_ns", "<i8"),
-        ("utc_ns", "<i8"),
-        ("device_counter", "<i8"),
-        ("flags", "<i4"),
-        ("crc32", "<u4"),
+        *((name, "<i8") for name in ("first_sample", "first_row", "n_samples")),
+        *_RECEIVED,
+        *[("device_counter", "<i8"), ("flags", "<i4"), ("crc32", "<u4")],
     ]
 )
 GAP_DTYPE = np.dtype(
     [("first_sample", "<i8"), ("missing", "<i8"), ("estimated", "<i4"), ("reason", "S100")]
 )
-EVENT_DTYPE = np.dtype(
-    [
-        ("monotonic_ns", "<i8"),
-        ("utc_ns", "<i8"),
-        ("sensor", "S64"),
-        ("kind", "S32"),
-        ("text", "S200"),
-    ]
-)
-READING_DTYPE = np.dtype(
-    [
-        ("monotonic_ns", "<i8"),
-        ("utc_ns", "<i8"),
-        ("sensor", "S64"),
-        ("quantity", "S32"),
-        ("value", "<f8"),
-    ]
-)
+EVENT_DTYPE = np.dtype([*_SAID, ("kind", "S32"), ("text", "S200")])
+READING_DTYPE = np.dtype([*_SAID, ("quantity", "S32"), ("value", "<f8")])
 
 # Columns of ``/committed``. The last row has the number of events, whether the file is closed, and
 # the number of readings.
