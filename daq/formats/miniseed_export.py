@@ -13,7 +13,7 @@ import io
 import math
 import re
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -164,9 +164,7 @@ def _runs(recording: Recording, sensor: SensorRecord) -> Iterator[_Run]:
     blocks = blocks[blocks["n_samples"] > 0]
     if not len(blocks):
         return
-    first = blocks["first_sample"].astype(np.int64)
-    length = blocks["n_samples"].astype(np.int64)
-    rows = blocks["first_row"].astype(np.int64)
+    first, length, rows = (blocks[name] for name in ("first_sample", "n_samples", "first_row"))
     times, ends = _times(recording, sensor, blocks)
     interval = NS_PER_S / sensor.sampling_rate
     begins = np.concatenate([[True], first[1:] != (first + length)[:-1]])
@@ -204,17 +202,14 @@ def _times(
     recording: Recording, sensor: SensorRecord, blocks: NDArray[np.void]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return UTC of each block's begin and end: as stated, or by the clock of the sensor."""
-    first = blocks["first_sample"].astype(np.int64)
-    length = blocks["n_samples"].astype(np.int64)
+    first, length = blocks["first_sample"], blocks["n_samples"]
     if (blocks["flags"] & int(BlockFlag.DEVICE_UTC)).all():
-        stated = blocks["device_counter"].astype(np.int64)
+        stated = blocks["device_counter"]
         return stated, _ends(stated, blocks, sensor.sampling_rate)
     created = recording.created_at
     if sensor.polled:
-        instants = [
-            int(sensor.instants_ns(int(row), int(row) + 1)[0]) for row in blocks["first_row"]
-        ]
-        polls: NDArray[np.int64] = np.array(instants, np.int64)
+        rows = blocks["first_row"].tolist()
+        polls = np.concatenate([sensor.instants_ns(row, row + 1) for row in rows])
         polls += created.utc_ns - created.monotonic_ns
         return polls, _ends(polls, blocks, sensor.sampling_rate)
     arrivals = ArrivalTimes(sensor.sampling_rate, created.monotonic_ns, created.utc_ns)
@@ -234,8 +229,7 @@ def _times(
 
 def _ends(times: NDArray[np.int64], blocks: NDArray[np.void], rate: float) -> NDArray[np.int64]:
     """Return the ends of blocks: the next begin, or else at the rate of the block before."""
-    first = blocks["first_sample"].astype(np.int64)
-    length = blocks["n_samples"].astype(np.int64)
+    first, length = blocks["first_sample"], blocks["n_samples"]
     ends: NDArray[np.int64] = times + np.rint(length * (NS_PER_S / rate)).astype(np.int64)
     restarted = (blocks["flags"] & int(BlockFlag.CLOCK_RESTART)) != 0
     joined = [False, *((first[1:] == (first + length)[:-1]) & ~restarted[1:]), False]
@@ -265,41 +259,26 @@ def _records(
         )
     for number, first, end in _present(sensor, *rows):
         name = sensor.channels[number].name
-        known = codes[sensor.name, name]
         samples, encoding = _encodable(counts[first:end, number], f"{sensor.name}.{name}")
-        trace = obspy.Trace(
-            samples,
-            {
-                "network": known.network,
-                "station": known.station,
-                "location": known.location,
-                "channel": known.channel,
-                "sampling_rate": sensor.sampling_rate,
-                "starttime": obspy.UTCDateTime(
-                    ns=start_ns + round(first * NS_PER_S / sensor.sampling_rate)
-                ),
-            },
-        )
-        trace.write(
-            content,
-            format="MSEED",
-            encoding=encoding,
-            reclen=_SHORT_RECORD if end - first <= _SHORT_ROWS else _RECORD,
-        )
+        at = start_ns + round(first * NS_PER_S / sensor.sampling_rate)
+        about = {"sampling_rate": sensor.sampling_rate, "starttime": obspy.UTCDateTime(ns=at)}
+        trace = obspy.Trace(samples, asdict(codes[sensor.name, name]) | about)
+        length = _SHORT_RECORD if end - first <= _SHORT_ROWS else _RECORD
+        trace.write(content, format="MSEED", encoding=encoding, reclen=length)
     return content.getvalue()
 
 
 def _present(sensor: SensorRecord, first_row: int, last_row: int) -> Iterator[tuple[int, int, int]]:
     """Yield each channel's number with each piece of the rows, from `first_row`, that it has."""
     absent = list(absences(sensor.absent, first_row, last_row))
+    length = last_row - first_row
     for number in range(len(sensor.channels)):
         begin = 0
-        for lacking in sorted((rows.start, rows.stop) for n, rows in absent if n == number):
-            if lacking[0] > begin:
-                yield number, begin, lacking[0]
-            begin = max(begin, lacking[1])
-        if begin < last_row - first_row:
-            yield number, begin, last_row - first_row
+        lacking = sorted((rows.start, rows.stop) for n, rows in absent if n == number)
+        for first, end in (*lacking, (length, length)):
+            if first > begin:
+                yield number, begin, first
+            begin = max(begin, end)
 
 
 def _encodable(samples: NDArray[Any], name: str) -> tuple[NDArray[Any], str]:
