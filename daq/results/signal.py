@@ -221,7 +221,8 @@ class _Sensor:
     def __init__(self, record: ReadableSensor, created: tuple[int, int]) -> None:
         self.record = record
         self._source = SensorSource.of(record, *created)
-        self._clock: Clock | None = None
+        self.clock: Clock | None = None
+        """None before the first block."""
 
     def refresh(self) -> None:
         """Take new blocks."""
@@ -229,10 +230,10 @@ class _Sensor:
         source.refresh()
         if source.n_blocks > before:
             if source.polled:
-                self._clock = source.by_instants()
+                self.clock = source.by_instants()
             else:
                 arrivals = source.arrivals if source.device_utc else _thinned(source.arrivals)
-                self._clock = arrivals.solve(self.record.name).extended(source.end_sample)
+                self.clock = arrivals.solve(self.record.name).extended(source.end_sample)
             runs = [(r.first_sample, r.first_row, r.n_samples) for r in source.runs]
             self._runs = np.array(runs)
 
@@ -241,23 +242,18 @@ class _Sensor:
         rows = self._runs[:, 1]
         return np.asarray(rows[(rows > first) & (rows < last)])
 
-    @property
-    def clock(self) -> Clock | None:
-        """None before the first block."""
-        return self._clock
-
     def at(self, samples: FloatArray) -> FloatArray:
         """Return the times of samples, in s since the recording was created."""
-        return np.zeros(len(samples)) if self._clock is None else self._clock.at(samples)
+        return np.zeros(len(samples)) if self.clock is None else self.clock.at(samples)
 
     def rows(self, seconds: FloatArray) -> IntArray:
         """Return the first row at or after each of ascending times."""
-        if self._clock is None:
+        if self.clock is None:
             return np.zeros(len(seconds), np.int64)
-        starts, _ = self._clock.spans
+        starts, _ = self.clock.spans
         epoch = np.maximum(np.searchsorted(starts, seconds, side="right") - 1, 0)
-        ends = np.array([each.end_sample for each in self._clock.epochs])[epoch]
-        sample = np.minimum(np.ceil(self._clock.position(seconds) - 1e-6), ends).astype(np.int64)
+        ends = np.array([each.end_sample for each in self.clock.epochs])[epoch]
+        sample = np.minimum(np.ceil(self.clock.position(seconds) - 1e-6), ends).astype(np.int64)
         first, row, length = self._runs.T
         run = np.maximum(np.searchsorted(first, sample, side="right") - 1, 0)
         rows = row[run] + np.clip(sample - first[run], 0, length[run])
@@ -299,7 +295,8 @@ class Signal:
         self._created = created.monotonic_ns, created.utc_ns
         self._sensors = [_Sensor(record, self._created) for record in recording.sensors]
         self._extremes: tuple[Extremes, ...] = extremes_of(recording, progress)
-        self._marks: tuple[Mark, ...] = ()
+        self.marks: tuple[Mark, ...] = ()
+        """Events, gaps, and stretches at the end of the range, in order."""
         self.refresh()
 
     def refresh(self) -> None:
@@ -307,7 +304,7 @@ class Signal:
         for sensor, extremes in zip(self._sensors, self._extremes, strict=True):
             sensor.refresh()
             extremes.extend()
-        self._marks = tuple(sorted(self._all_marks(), key=lambda mark: (mark.begin, mark.kind)))
+        self.marks = tuple(sorted(self._all_marks(), key=lambda mark: (mark.begin, mark.kind)))
 
     @property
     def span(self) -> tuple[float, float]:
@@ -317,11 +314,6 @@ class Signal:
             return self._origin, self._origin + 1.0
         begin, end = min(clock.start for clock in clocks), max(clock.end for clock in clocks)
         return self._origin + begin, self._origin + max(end, begin + 1e-3)
-
-    @property
-    def marks(self) -> tuple[Mark, ...]:
-        """Events, gaps, and stretches at the end of the range, in order."""
-        return self._marks
 
     def view(
         self, begin: float, end: float, n_columns: int, besides: Sequence[Mark] = ()
@@ -349,7 +341,7 @@ class Signal:
                         ends.max(axis=0),
                     )
                 )
-        here = [mark for mark in (*self._marks, *besides) if mark.begin < end and mark.end >= begin]
+        here = [mark for mark in (*self.marks, *besides) if mark.begin < end and mark.end >= begin]
         return Waveforms(begin, end, tuple(traces), joined(here, (end - begin) / n_columns))
 
     def _all_marks(self) -> Iterable[Mark]:
@@ -358,17 +350,14 @@ class Signal:
             at = (utc_ns + event.received.monotonic_ns - monotonic_ns) * 1e-9
             yield Mark(at, at, str(event.kind), event.sensor, event.text)
         for sensor in self._sensors:
-            name, gaps, clipped = (
-                sensor.record.name,
-                sensor.record.gaps,
-                sensor.record.blocks.clipped,
-            )
+            name, gaps = sensor.record.name, sensor.record.gaps
             first = gaps["first_sample"].astype(np.float64)
             begins = self._origin + sensor.at(first)
             ends = self._origin + sensor.at(first + gaps["missing"])
             for begin, end, reason in zip(begins, ends, gaps["reason"], strict=True):
                 yield Mark(float(begin), float(end), GAP, name, reason.decode(errors="replace"))
-            for begin, end in (self._origin + sensor.at(each.astype(float)) for each in clipped):
+            for each in sensor.record.blocks.clipped.astype(float):
+                begin, end = self._origin + sensor.at(each)
                 yield Mark(float(begin), float(end), CLIPPED, name, "at the end of its range")
 
     def excluded(self, snapshot: Snapshot | None, exclude: Iterable[str] = ()) -> list[Mark]:
@@ -396,9 +385,8 @@ class Signal:
 
     def channel(self, number: int) -> tuple[str, Channel]:
         """Return the sensor and the channel of a trace."""
-        return [(s.record.name, channel) for s in self._sensors for channel in s.record.channels][
-            number
-        ]
+        found = [(s.record.name, channel) for s in self._sensors for channel in s.record.channels]
+        return found[number]
 
     def spectrogram(
         self,
