@@ -135,27 +135,42 @@ psd = [[1, 2], [3, 4]]
 
 
 @pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("name = 3", ": expected a text"),
+        ('sampling_rate = "200"', ": expected a number"),
+        ('estimate.segment = "fast"', ": expected a positive duration"),
+        ('estimate.window = "han"', "(did you mean 'hann'?)"),
+        ('estimate.window = "kaiser"', "with a parameter above 0, such as kaiser,0.5"),
+        ('estimate.method = "three_sensor"', "(did you mean 'three-sensor'?)"),
+        ('estimate.segmnt = "1s"', ": unknown key; expected one of method, segment, overlap"),
+        ('estimate.reject = "yes"', ": expected true or false"),
+        ("estimate.octaves = 1", ": expected true or false"),
+        ('estimate.dimension = "all"', 'expected "auto", or a number of dimensions such as 3'),
+        ("estimate.dimension = 2", 'with method = "maximum-likelihood" or "all" only'),
+        ("estimate.overlap = 1", ": expected a fraction from 0 to less than 1"),
+        (
+            'recording.duration = "19s"',
+            "expected at least 20s: an estimate needs 3 segments of 10s",
+        ),
+        ('schedule.time_zone = "Mars"', ": expected a time zone"),
+        ("simulation.speed = 0", ": expected a positive number"),
+    ],
+)
+def test_each_fault_names_file_key_value_and_what_was_expected(line: str, said: str) -> None:
+    key = line.partition("=")[0]
+    others = [each for each in HEAD.splitlines() if not each.startswith(key)]
+    (found,) = faults("\n".join([*others, line, THREE]))
+    assert found.startswith(f"bench.toml: {line}: ")
+    assert said in found
+
+
+@pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("name = 3\n", "bench.toml: name = 3: expected a text"),
-        ('sampling_rate = "200"\n', 'sampling_rate = "200": expected a number'),
-        (
-            '[estimate]\nsegment = "fast"\n',
-            'estimate.segment = "fast": expected a positive duration',
-        ),
         (
             sensor_text("d").replace("/dev/d", ""),
             'sensors["d"].port = "": expected a port, such as /dev/ttyUSB0',
-        ),
-        ('[estimate]\nwindow = "han"\n', "(did you mean 'hann'?)"),
-        (
-            '[estimate]\nwindow = "kaiser"\n',
-            "expected the window with a parameter above 0, such as kaiser,0.5",
-        ),
-        ('[estimate]\nmethod = "three_sensor"\n', "(did you mean 'three-sensor'?)"),
-        (
-            '[estimate]\nsegmnt = "1s"\n',
-            'estimate.segmnt = "1s": unknown key; expected one of method, segment, overlap',
         ),
         (
             '[estimate]\nsegment = "10ms"\n',
@@ -166,21 +181,8 @@ psd = [[1, 2], [3, 4]]
             "estimate.band = [0.01, 50.0]: expected [low, high] in Hz from 0.1",
         ),
         (
-            '[estimate]\nreject = "yes"\n',
-            'estimate.reject = "yes": expected true or false',
-        ),
-        ("[estimate]\noctaves = 1\n", "estimate.octaves = 1: expected true or false"),
-        (
-            '[estimate]\ndimension = "all"\n',
-            'estimate.dimension = "all": expected "auto", or a number of dimensions such as 3',
-        ),
-        (
             '[estimate]\nmethod = "maximum-likelihood"\ndimension = 4\n',
             'estimate.dimension = "4": expected at most 3: 6 channels cannot separate more',
-        ),
-        (
-            "[estimate]\ndimension = 2\n",
-            'estimate.dimension = 2: expected with method = "maximum-likelihood" or "all" only',
         ),
         (
             "[estimate]\ngains = {b = 1.1}\n",
@@ -203,19 +205,9 @@ psd = [[1, 2], [3, 4]]
             'estimate.gains = "b.z=2": expected one of a, b, c, a.x',
         ),
         (
-            "[estimate]\noverlap = 1\n",
-            "estimate.overlap = 1: expected a fraction from 0 to less than 1",
-        ),
-        (
-            '[recording]\nduration = "19s"\n',
-            '"19s": expected at least 20s: an estimate needs 3 segments of 10s',
-        ),
-        (
             '[schedule]\ncron = ["every day"]\n',
             'schedule.cron[1] = "every day": expected a cron line',
         ),
-        ('[schedule]\ntime_zone = "Mars"\n', 'schedule.time_zone = "Mars": expected a time zone'),
-        ("[simulation]\nspeed = 0\n", "simulation.speed = 0: expected a positive number"),
         (
             '[[limits]]\nname = "n"\nfrequency = [2, 1]\npsd = [1, 1]\n',
             'limits["n"]: 1 Hz after 2 Hz; expected increasing frequencies',
@@ -270,14 +262,10 @@ psd = [[1, 2], [3, 4]]
         ),
     ],
 )
-def test_each_fault_names_file_key_value_and_what_was_expected(text: str, expected: str) -> None:
-    keys = text.partition("=")[0].strip()
-    head = "\n".join(line for line in HEAD.splitlines() if not line.startswith(f"{keys} ="))
-    top = text if text.startswith(("name", "sampling_rate")) else ""
-    found = faults(f"{head}\n{top}{THREE}{'' if top else text}")
-    assert len(found) == 1, found
-    assert found[0].startswith("bench.toml: ")
-    assert expected in found[0]
+def test_each_fault_of_a_table_names_it_and_what_was_expected(text: str, expected: str) -> None:
+    (found,) = faults(HEAD + THREE + text)
+    assert found.startswith("bench.toml: ")
+    assert expected in found
 
 
 def test_too_few_sensors_are_refused() -> None:
