@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,7 +16,6 @@ from daq.archive.index import ROLLUP
 from daq.archive.plan import Plan
 from daq.archive.sources import sort
 from daq.archive.store import PLAN_FILE, Store
-from daq.archive.task import Task
 from daq.bench.channel import Channel
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -109,13 +106,8 @@ def store_for(
 def fill(store: Store, paths: Sequence[Path], *, jobs: int = 1) -> list[str]:
     """Take what is new into an archive; returns failures."""
     found = sort(paths, store.entries()[0])
-    outcomes = carried_out(tasks(store, found.new), jobs=jobs)
+    outcomes = carried_out(tasks_of(store, found.new), jobs=jobs)
     return found.failures + [each.failure for each in outcomes if each.failure]
-
-
-def tasks(store: Store, new: Sequence[tuple[str, Path, datetime]]) -> list[Task]:
-    """Return tasks for recordings."""
-    return tasks_of(store, new)
 
 
 def content(store: Store) -> dict[str, bytes]:
@@ -147,8 +139,3 @@ def values(store: Store) -> dict[str, bytes]:
             take("/", file)
             file.visititems(take)
     return found
-
-
-def with_reject(settings: Settings) -> Settings:
-    """Return settings that exclude transients."""
-    return replace(settings, reject=True)

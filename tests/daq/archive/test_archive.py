@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from daq.archive.answers import Answer, answer
 from daq.archive.density import LOWEST_DB, Density
-from daq.archive.execution import carried_out, is_exposed
+from daq.archive.execution import carried_out, is_exposed, tasks_of
 from daq.archive.facts import AbsencesNotUsed, facts_of_archive
 from daq.archive.index import FILE as INDEX
 from daq.archive.index import ROLLUP
@@ -45,9 +45,7 @@ from tests.daq.archive.months import (
     fill,
     record,
     store_for,
-    tasks,
     three,
-    with_reject,
 )
 
 SNR = 25.0**2
@@ -78,7 +76,7 @@ def copy(store: Store, tmp_path: Path) -> Store:
     ("free", "settings", "stretch"),
     [
         (False, SETTINGS, "day"),
-        pytest.param(True, with_reject(SETTINGS), "hour", marks=pytest.mark.long),
+        pytest.param(True, replace(SETTINGS, reject=True), "hour", marks=pytest.mark.long),
     ],
 )
 def test_the_pooled_estimate_is_that_of_all_recordings(
@@ -118,7 +116,7 @@ def test_processes_that_were_interrupted_and_resumed_write_the_same_bytes(
     paths: list[Path], store: Store, tmp_path: Path
 ) -> None:
     other = store_for(tmp_path / "other", paths[0])
-    outcomes = carried_out(tasks(other, sort(paths, ()).new), jobs=2)
+    outcomes = carried_out(tasks_of(other, sort(paths, ()).new), jobs=2)
     assert next(outcomes).failure == ""
     outcomes.close()  # ends the processes, whatever they do
     with other.writing():
@@ -170,7 +168,7 @@ def test_a_failed_task_is_reported_and_the_others_are_completed(
     paths: list[Path], store: Store, tmp_path: Path
 ) -> None:
     other = store_for(tmp_path / "other", paths[0])
-    work = tasks(other, sort(paths, ()).new)
+    work = tasks_of(other, sort(paths, ()).new)
     work.insert(1, Task("no.h5", "nowhere/no.h5", "[" * 10**5, work[0].software))
     outcomes = list(carried_out(work))
     assert [bool(each.failure) for each in outcomes].count(True) == 1

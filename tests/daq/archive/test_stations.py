@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,8 @@ from daq.archive.execution import carried_out
 from daq.archive.plan import Plan
 from daq.archive.sources import are_waveforms
 from daq.archive.spectra_file import SpectraFile
-from daq.archive.stations import Run, archives_in, begun, summaries, work
+from daq.archive.stations import archives_in, begun, summaries, work
 from daq.archive.store import Store
-from daq.archive.task import Outcome, Task
 from daq.archive.waveforms import FILE, Contents, FileReading, FoundFiles, stations_in
 from daq.errors import ImportFormatError, WrongArchiveError, WrongSettingError
 from daq.estimation.estimation import estimate
@@ -48,15 +48,6 @@ def found_in(
     return found
 
 
-def in_processes(jobs: int) -> Run:
-    """Return what carries out tasks in so many processes."""
-
-    def run(tasks: Iterable[Task]) -> Iterator[Outcome]:
-        return carried_out(tasks, jobs=jobs)
-
-    return run
-
-
 def fill(
     source: str | Path,
     store: Path,
@@ -69,7 +60,7 @@ def fill(
 ) -> tuple[dict[str, Store], int, list[str]]:
     """Take new days; returns the archives, how many days were new, and failures."""
     found = found_in(source, store, selection, groups)
-    run = in_processes(jobs)
+    run = partial(carried_out, jobs=jobs)
     stores, failures = begun(
         store, found.stations, settings, "hour", reading=reading, run=run, check=repr
     )
@@ -205,7 +196,7 @@ def test_what_is_wrong_is_said_before_there_is_a_folder(sds: Path, tmp_path: Pat
         raise WrongSettingError(plan.sensors[0][1][0][1])
 
     stations = found_in(f"sds://{sds}", tmp_path).stations
-    about = {"reading": FileReading(), "run": in_processes(1)}
+    about = {"reading": FileReading(), "run": carried_out}
     with pytest.raises(WrongSettingError, match="counts"):
         begun(tmp_path, stations, SETTINGS, "hour", check=refuse, **about)  # type: ignore[arg-type]  # of several types
     wrong = replace(SETTINGS, segment=7200.0)

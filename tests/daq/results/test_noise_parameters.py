@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from daq.results.noise_parameters import (
 )
 from daq.results.result import Result
 from estimator.noise_parameters.fit import Term
+from tests.daq.results.decision.benches import PLAIN
 from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
 from tui.output.noise_parameters import notes, quantisation_notes, sheet_table, term_table
 
@@ -43,9 +43,12 @@ full_scale = 10.0
 
 def bench(more: str = "", **numbers: float) -> Bench:
     """Return the bench of the template, its first sensor with a data sheet."""
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     sheet = SHEET.format(more=more, **({"density": 1e-6, "rms": 1e-6, "decibels": 100.0} | numbers))
-    return parse(text.replace('[[sensors]]\nname = "B"', f'{sheet}\n[[sensors]]\nname = "B"'))
+    return with_sheet(sheet)
+
+
+def with_sheet(sheet: str) -> Bench:
+    return parse(PLAIN.replace('[[sensors]]\nname = "B"', f'{sheet}\n[[sensors]]\nname = "B"'))
 
 
 def test_white_noise_of_every_channel_is_found() -> None:
@@ -122,18 +125,12 @@ def test_a_data_sheet_has_its_own_unit_and_channels() -> None:
 
 
 def test_impossible_data_sheets_are_refused_with_what_is_expected() -> None:
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     for sheet, expected in (
         ("integrated_noise = [[10.0, 1.0, 1e-6]]", "lower frequency first"),
         ("dynamic_range = [[1.0, 10.0, 120.0]]", "full_scale"),
     ):
         with pytest.raises(BenchFileError, match=expected):
-            parse(
-                text.replace(
-                    '[[sensors]]\nname = "B"',
-                    f'[sensors.data_sheet]\n{sheet}\n[[sensors]]\nname = "B"',
-                )
-            )
+            with_sheet(f"[sensors.data_sheet]\n{sheet}")
 
 
 def coarse(path: Path, step: float) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
 from estimator.self_noise.result import Flag, SelfNoise
-from tests.daq.results.decision.benches import bench_with, verdict_on
+from tests.daq.results.decision.benches import PLAIN, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 
 
@@ -95,7 +94,7 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     rng = np.random.default_rng(11)
     snapshot, settings = made_snapshot(), replace(SETTINGS, window="rectangular", overlap=0.0)
     snapshot = replace(snapshot, n_effective=1e6)  # the c.o.v. is known here
-    noise, bench = snapshot.results["three-sensor"], bench_with(4e-12)
+    noise = snapshot.results["three-sensor"]
     shape, level = noise.noise_psd.shape, 4e-12
     cumulants = np.broadcast_to(
         (level ** np.array([2, 3, 4]) / 400.0 ** np.array([1, 2, 3]))[:, None, None], (3, *shape)
@@ -104,8 +103,7 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
     for _ in range(n_tests):
         drawn = level * (1 + 0.05 * rng.normal(size=shape))
         results = {"three-sensor": SelfNoise.of("three-sensor", drawn, cumulants, noise.flags)}
-        found = Result(replace(snapshot, results=results), settings, bench).verdict
-        assert found is not None
+        found = verdict_on(replace(snapshot, results=results), level, settings=settings)
         n_failing += found.verdict is Verdict.FAIL
     # One test in forty, and four standard deviations: 10; channel by channel it would be 24.
     expected = n_tests / 40
@@ -113,8 +111,7 @@ def test_a_channel_just_at_its_mask_seldom_fails() -> None:
 
 
 def test_without_limits_there_is_no_verdict() -> None:
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    assert Result(made_snapshot(), SETTINGS, parse(text)).verdict is None
+    assert Result(made_snapshot(), SETTINGS, parse(PLAIN)).verdict is None
     assert Result(made_snapshot(), SETTINGS).verdict is None
 
 
@@ -334,8 +331,7 @@ def test_dimensions_that_do_not_explain_the_averages_decide_nothing(
 ) -> None:
     settings = replace(SETTINGS, methods=("maximum-likelihood",))
     snapshot = with_further_dimensions(0.04, accepted=accepted)
-    found = Result(snapshot, settings, bench_with(1.05e-11)).verdict
-    assert found is not None
+    found = verdict_on(snapshot, 1.05e-11, settings=settings)
     assert found.verdict is (verdict or Verdict.NOT_DECIDED)
     if verdict is None:
         undecided = {each.obstacle for each in found.having(Verdict.NOT_DECIDED)}

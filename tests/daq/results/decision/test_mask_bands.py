@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -14,16 +13,13 @@ from daq.results.result import Result
 from estimator.decision.comparison import mask_edges
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.self_noise.result import SelfNoise
-from tests.daq.results.decision.benches import MASK, bench_with, verdict_on
+from tests.daq.results.decision.benches import PLAIN, bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, made_snapshot
 from tui.wording.verdict_text import not_judged
 
 
 def test_a_mask_outside_the_spectrum_decides_nothing() -> None:
-    text = MASK.format(psd=1e-15, more="").replace("[1.0, 30.0]", "[300.0, 400.0]")
-    base = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    found = Result(made_snapshot(), SETTINGS, parse(base + text)).verdict
-    assert found is not None
+    found = verdict_on(made_snapshot(), 1e-15, frequency=(300.0, 400.0))
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.OUTSIDE_SPECTRUM,)
     assert found.prediction is None
@@ -44,16 +40,15 @@ def test_a_band_is_judged_only_if_all_of_it_is_known() -> None:
 @pytest.mark.parametrize(
     ("psd", "verdict"),
     [
-        ("[12e-12, 12e-12, 4e-12, 4e-12, 12e-12, 12e-12]", Verdict.FAIL),  # noise up to 9e-12
-        ("[12e-12, 12e-12, 11e-12, 11e-12, 12e-12, 12e-12]", Verdict.PASS),
+        ((12e-12, 12e-12, 4e-12, 4e-12, 12e-12, 12e-12), Verdict.FAIL),  # noise up to 9e-12
+        ((12e-12, 12e-12, 11e-12, 11e-12, 12e-12, 12e-12), Verdict.PASS),
     ],
 )
-def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(psd: str, verdict: Verdict) -> None:
-    text = MASK.format(psd=0, more="").replace("[0, 0]", psd)
-    text = text.replace("[1.0, 30.0]", "[1.0, 15.9, 16.0, 17.0, 17.1, 30.0]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = Result(made_snapshot(n_effective=20_000.0), SETTINGS, bench).verdict
-    assert found is not None
+def test_a_mask_is_judged_in_a_notch_narrower_than_a_band(
+    psd: tuple[float, ...], verdict: Verdict
+) -> None:
+    points = (1.0, 15.9, 16.0, 17.0, 17.1, 30.0)
+    found = verdict_on(made_snapshot(n_effective=20_000.0), psd, frequency=points)
     assert found.verdict is verdict
     if verdict is Verdict.FAIL:
         assert all(15.9 < each.frequency < 17.1 for each in found.having(Verdict.FAIL))
@@ -71,10 +66,7 @@ def test_the_point_of_a_mask_divides_a_band_where_it_bends_by_a_factor_of_two(
 
 
 def test_a_band_of_one_frequency_is_named_by_it() -> None:
-    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 2.0]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = Result(made_snapshot(), SETTINGS, bench).verdict
-    assert found is not None
+    found = verdict_on(made_snapshot(), 12e-12, frequency=(1.0, 2.0))
     assert {each.frequency for each in found.limits} <= {1.0, 1.5, 2.0}
 
 
@@ -126,10 +118,7 @@ def test_a_mask_is_in_the_unit_of_the_bench_file() -> None:
 def test_where_a_mask_goes_beyond_the_spectrum_the_verdict_says_so(
     low: float, high: float, judged: tuple[float, float], words: list[str]
 ) -> None:
-    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", f"[{low}, {high}]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, bench).verdict
-    assert found is not None
+    found = verdict_on(made_snapshot(n_effective=5000.0), 12e-12, frequency=(low, high))
     assert found.verdict is Verdict.PASS
     assert {(each.covers, each.judged) for each in found.limits} == {((low, high), judged)}
     lines = not_judged(found)
@@ -147,10 +136,8 @@ def test_unusable_high_frequencies_are_not_judged_and_said() -> None:
         name: replace(noise, noise_psd=noise.noise_psd * blank, cov=noise.cov * blank)
         for name, noise in snapshot.results.items()
     }
-    text = MASK.format(psd=12e-12, more="").replace("[1.0, 30.0]", "[1.0, 90.0]")
-    bench = parse(resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8") + text)
-    found = Result(replace(snapshot, csm=csm, results=results), SETTINGS, bench).verdict
-    assert found is not None
+    known_to_45 = replace(snapshot, csm=csm, results=results)
+    found = verdict_on(known_to_45, 12e-12, frequency=(1.0, 90.0))
     assert found.verdict is Verdict.PASS
     (line,) = not_judged(found)
     assert found.limits[0].judged == (1.0, 45.0)
@@ -160,8 +147,7 @@ def test_unusable_high_frequencies_are_not_judged_and_said() -> None:
 def test_a_model_is_a_limit_in_any_unit() -> None:
     """The ground's noise models are in m/s²; the channels of this bench are, too."""
     more = '[[limits]]\nname = "loud"\nmodel = "ahnm"\n[[limits]]\nname = "quiet"\nmodel = "nlnm"'
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text("utf-8")
-    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, parse(f"{text}\n{more}")).verdict
+    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, parse(f"{PLAIN}\n{more}")).verdict
     assert found is not None
     verdicts = {(each.limit, each.verdict) for each in found.limits}
     # noise of -120 to -110 dB: below -91 dB in part, above -120 dB at 0.8 s, above the NLNM

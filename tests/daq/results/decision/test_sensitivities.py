@@ -9,17 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from daq.estimation.snapshot import Snapshot
-from daq.results.decision.verdict import TestVerdict
-from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.relative_response import relative_response
 from estimator.checks.sensitivities import CAUSES, Cause
 from estimator.decision.verdict import Obstacle, Verdict
 from estimator.methods import self_noise
-from tests.daq.results.decision.benches import bench_with
+from tests.daq.results.decision.benches import verdict_on
 from tests.estimator.csm_models import wishart
-from tests.tui.example_snapshot import SETTINGS, diagnosed
+from tests.tui.example_snapshot import diagnosed
 
 NOISE = 1e-12
 N_AVERAGES = 600
@@ -61,12 +59,6 @@ def drawn_gains(rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.
     return gains
 
 
-def verdict_of(snapshot: Snapshot, limit: float, more: str = "") -> TestVerdict:
-    found = Result(snapshot, SETTINGS, bench_with(limit, more)).verdict
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize(
     ("n_draws", "seed"), [(12, 5), pytest.param(200, 6, marks=pytest.mark.study)]
 )
@@ -75,7 +67,7 @@ def test_no_channel_passes_by_its_wrong_gain(n_draws: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for _ in range(n_draws):
         gains = drawn_gains(rng)
-        found = verdict_of(snapshot_of(rng, gains), NOISE / 10**0.1)
+        found = verdict_on(snapshot_of(rng, gains), NOISE / 10**0.1)
         assert not any(each.verdict is Verdict.PASS for each in found.limits)
 
 
@@ -83,7 +75,7 @@ def test_no_channel_passes_by_its_wrong_gain(n_draws: int, seed: int) -> None:
 def test_a_sound_bench_keeps_its_verdict(limit: float) -> None:
     for seed in range(4):
         snapshot = snapshot_of(np.random.default_rng(seed), np.ones(9))
-        found = verdict_of(snapshot, limit)
+        found = verdict_on(snapshot, limit)
         assert found.sensitivities == ()
         assert found.verdict is (Verdict.PASS if limit > NOISE else Verdict.FAIL)
 
@@ -91,7 +83,7 @@ def test_a_sound_bench_keeps_its_verdict(limit: float) -> None:
 def test_the_verdict_names_sensor_factor_and_cause() -> None:
     gains = np.repeat([1.0, 1.0, 0.3], 3)
     snapshot = snapshot_of(np.random.default_rng(2), gains)
-    found = verdict_of(snapshot, NOISE / 2)  # C reads 0.09 of its noise
+    found = verdict_on(snapshot, NOISE / 2)  # C reads 0.09 of its noise
     assert {each.verdict for each in found.limits if each.sensor == "C"} == {Verdict.NOT_DECIDED}
     assert {each.obstacle for each in found.limits if each.sensor == "C"} == {Obstacle.SENSITIVITY}
     assert [each.channels for each in found.sensitivities] == [("C.X", "C.Y", "C.Z")]
@@ -101,8 +93,8 @@ def test_the_verdict_names_sensor_factor_and_cause() -> None:
     by_gravity = replace(found.sensitivities[0], cause=Cause.GRAVITY)
     assert f"({CAUSES[Cause.GRAVITY]})" in by_gravity.line
     # Neither of both sensitivities passes here, or fails there: the verdict does not depend on it.
-    assert verdict_of(snapshot, NOISE * 20).verdict is Verdict.PASS
-    assert {each.verdict for each in verdict_of(snapshot, NOISE / 40).limits} == {Verdict.FAIL}
+    assert verdict_on(snapshot, NOISE * 20).verdict is Verdict.PASS
+    assert {each.verdict for each in verdict_on(snapshot, NOISE / 40).limits} == {Verdict.FAIL}
 
 
 def test_a_sensor_that_was_carried_away_is_not_told_to_correct_its_sensitivity() -> None:
@@ -114,7 +106,7 @@ def test_a_sensor_that_was_carried_away_is_not_told_to_correct_its_sensitivity()
     )
     diagnostics = replace(snapshot.diagnostics, diagnosis=replace(diagnosis, advice=(away,)))
     for given in (snapshot, replace(snapshot, diagnostics=diagnostics)):
-        (wrong,) = verdict_of(given, NOISE / 1.3).sensitivities
+        (wrong,) = verdict_on(given, NOISE / 1.3).sensitivities
         assert (wrong.cause is Cause.CHANGED) == (given is not snapshot)
         assert ("correct its sensitivity" in wrong.line) == (given is snapshot)
     assert str(wrong).endswith("(it changed in the test). Record again.")
@@ -122,7 +114,7 @@ def test_a_sensor_that_was_carried_away_is_not_told_to_correct_its_sensitivity()
 
 def test_a_limit_failed_only_by_a_wrong_sensitivity_is_not_failed() -> None:
     snapshot = snapshot_of(np.random.default_rng(2), np.repeat([3.0, 1.0, 1.0], 3))
-    found = verdict_of(snapshot, 3 * NOISE)
+    found = verdict_on(snapshot, 3 * NOISE)
     assert found.verdict is Verdict.NOT_DECIDED
     assert found.obstacles == (Obstacle.SENSITIVITY,)
     assert found.prediction is None
