@@ -21,6 +21,15 @@ from tests.daq.formats.test_libraries import opened
 from tests.traced_memory import peak_of
 
 SAMPLES = np.arange(500)
+AT: dict[str, Any] = {"sampling_rate": 100.0}
+
+
+def refused(path: Path, said: str, **options: Any) -> None:  # noqa: ANN401 - of `import_files`
+    """See that a file is refused in words, and that nothing is written beside it."""
+    before = sorted(path.parent.iterdir())
+    with pytest.raises(ImportFormatError, match=said):
+        import_files([path], path.parent / "a.h5", **options)
+    assert sorted(path.parent.iterdir()) == before
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8", "utf-8-sig"])
@@ -37,22 +46,27 @@ def test_a_csv_is_read_in_the_encoding_it_has(tmp_path: Path, encoding: str) -> 
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"a/b": SAMPLES}, "sensor name 'a/b': expected a printable name without '/'"),
-        ({"x" * 80: SAMPLES}, "expected a name of 1 to 64 bytes"),
-        ({"\x1b[31mred": SAMPLES}, r"sensor name '\\x1b\[31mred': expected a printable name"),
+        ({"a/b": SAMPLES, **AT}, "sensor name 'a/b': expected a printable name without '/'"),
+        ({"x" * 80: SAMPLES, **AT}, "expected a name of 1 to 64 bytes"),
+        ({"\x1b[31mred": SAMPLES, **AT}, r"sensor name '\\x1b\[31mred': expected a printable name"),
         ({"A": SAMPLES, "sampling_rate": np.inf}, "positive sampling_rate"),
         ({"A": SAMPLES, "sampling_rate": 1e300}, r"of 1e\+300 Hz; expected 1e-06 to 1e\+07 Hz"),
         ({"A": SAMPLES, "sampling_rate": 1e-300}, "of 1e-300 Hz"),
-        ({"A": np.zeros((3, 200_000))}, "200000 channels; expected at most 1000"),
+        ({"A": np.zeros((3, 200_000)), **AT}, "200000 channels; expected at most 1000"),
+        ({"A": np.zeros((5, 2))}, "sampling_rate"),
+        ({"A": np.zeros((5, 2)), "sampling_rate": 0.0}, "positive sampling_rate"),
+        ({"A": np.zeros((5, 2)), "sampling_rate": np.ones(2)}, "one number"),
+        (AT, "no sensors"),
+        ({"A": np.zeros((5, 2, 1)), **AT}, r"\(n_samples, n_channels\)"),
+        ({"A": np.array(["x"]), **AT}, "expected numbers"),
+        ({"A": np.zeros(5), "start_time": "noon", **AT}, "start_time"),
     ],
 )
 def test_what_an_archive_has_wrong_is_named(
     tmp_path: Path, arrays: dict[str, Any], said: str
 ) -> None:
-    np.savez(tmp_path / "a.npz", **{"sampling_rate": 100.0} | arrays)
-    with pytest.raises(ImportFormatError, match=said):
-        import_files([tmp_path / "a.npz"], tmp_path / "a.h5")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.npz"]
+    np.savez(tmp_path / "a.npz", **arrays)
+    refused(tmp_path / "a.npz", said)
 
 
 def header(shape: tuple[int, ...]) -> bytes:
@@ -65,8 +79,7 @@ def header(shape: tuple[int, ...]) -> bytes:
 def test_an_archive_that_says_more_than_it_holds_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("A.npy", header((1 << 40,)) + bytes(1000))
-    with pytest.raises(ImportFormatError, match=r"shape \(1099511627776,\) in 1128 bytes"):
-        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+    refused(tmp_path / "a.npz", r"shape \(1099511627776,\) in 1128 bytes", sampling_rate=100.0)
 
 
 def test_an_archive_that_inflates_to_gigabytes_is_refused(tmp_path: Path) -> None:
@@ -77,8 +90,7 @@ def test_an_archive_that_inflates_to_gigabytes_is_refused(tmp_path: Path) -> Non
         file.write(header((1 << 26,)))
         for _ in range(1 << 6):
             file.write(bytes(1 << 23))
-    with pytest.raises(ImportFormatError, match=r"A\.npy: \d+ bytes that become 536871040"):
-        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+    refused(tmp_path / "a.npz", r"A\.npy: \d+ bytes that become 536871040", sampling_rate=100.0)
 
 
 def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
@@ -89,8 +101,7 @@ def test_a_matlab_file_that_inflates_to_gigabytes_is_refused(
     packed = zlib.compress(bytes(1 << 22))
     with (tmp_path / "a.mat").open("ab") as file:
         file.write(struct.pack("<II", 15, len(packed)) + packed)
-    with pytest.raises(ImportFormatError, match=r"array: \d+ bytes that become 42\d{5}"):
-        import_files([tmp_path / "a.mat"], tmp_path / "a.h5")
+    refused(tmp_path / "a.mat", r"array: \d+ bytes that become 42\d{5}")
 
 
 def element(kind: int, content: bytes) -> bytes:
@@ -110,8 +121,7 @@ def test_a_matlab_file_that_says_more_than_it_holds_is_refused(
     )
 
     def read() -> None:
-        with pytest.raises(ImportFormatError, match=said):
-            import_files([tmp_path / "a.mat"], tmp_path / "a.h5", sampling_rate=100.0)
+        refused(tmp_path / "a.mat", said, sampling_rate=100.0)
 
     assert peak_of(read) < 1 << 24
 
@@ -123,9 +133,8 @@ def test_all_arrays_of_a_file_together_become_no_more_than_it_can_hold(
     many: dict[str, Any] = {f"A{n}": np.zeros(1 << 16) for n in range(9)}
     np.savez_compressed(tmp_path / "a.npz", **many)
     savemat(tmp_path / "a.mat", many, do_compression=True)
-    for name in ("a.npz", "a.mat"):
-        with pytest.raises(ImportFormatError, match="bytes that become 1"):
-            import_files([tmp_path / name], tmp_path / "a.h5", sampling_rate=100.0)
+    for name in ("npz", "a.mat"):
+        refused(tmp_path / name, "bytes that become 1", sampling_rate=100.0)
 
 
 @pytest.mark.parametrize(
@@ -141,31 +150,16 @@ def test_what_numpy_does_not_write_is_refused(
 ) -> None:
     with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
         archive.writestr(name, header((1 << 20,)) + bytes(8 << 20))
-    with pytest.raises(ImportFormatError, match=f"{name}: {said}"):
-        import_files([tmp_path / "a.npz"], tmp_path / "a.h5", sampling_rate=100.0)
+    refused(tmp_path / "a.npz", f"{name}: {said}", sampling_rate=100.0)
 
 
-_WAV = b"RIFF\x24\0\0\0WAVEfmt "
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"\x86\xa8 world \xff", "not a WAV file: it does not begin with RIFF"),
-        (_WAV, "damaged or cut off"),
-        (_WAV + struct.pack("<IHHIIHH", 16, 7, 1, 8000, 8000, 1, 8) + b"data\0\0\0\0", "MULAW"),
-    ],
-)
-def test_what_a_wav_file_has_wrong_is_named(tmp_path: Path, content: bytes, said: str) -> None:
-    (tmp_path / "a.wav").write_bytes(content)
-    with pytest.raises(ImportFormatError, match=said):
-        import_files([tmp_path / "a.wav"], tmp_path / "a.h5")
+_WAV, _FORMAT = b"RIFF\x24\0\0\0WAVEfmt ", struct.Struct("<IHHIIHH")
 
 
 def test_a_wav_file_that_is_cut_off_is_read_and_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    described = struct.pack("<IHHIIHH", 16, 1, 1, 100, 200, 2, 16) + b"data\xff\xff\0\0"
+    described = _FORMAT.pack(16, 1, 1, 100, 200, 2, 16) + b"data\xff\xff\0\0"
     (tmp_path / "a.wav").write_bytes(b"RIFF\x23\0\1\0" + _WAV[8:] + described + bytes(400))
     assert opened(tmp_path / "a.wav")["a"].stretches[0].n_samples == 200
     assert "ends after 200 samples, before its header says" in caplog.text
@@ -181,21 +175,42 @@ def test_the_unit_of_times_without_one_is_said(
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("kind", "content", "said"),
     [
-        (b"\x00\x01\x02" * 1000, "not a text; expected a CSV file"),
-        (",".join(f"A.c{k}" for k in range(200_000)).encode(), "200000 columns; expected one a"),
-        (b"time,A.X,A.X\n0.0,1,2\n0.1,1,2\n", "several channels are named 'X'"),
-        (b"time,A.X\n", "expected rows of 2 cells"),
-        (b"", "expected a first line that names every column"),
-        (b"time (s),A.X\n1e12,1\n1000000000001,2\n", "time '1e12': beyond the year 2262"),
-        (b"time,A.X\n2500-01-01T00:00:00,1\n2500-01-01T00:00:01,2\n", "beyond the year 2262"),
-        (b"time,A.X\n0,1\ninf,2\n", "time 'inf': expected a finite number"),
-        (b"time,A.X\nnan,1\n1,2\n", "time 'nan': expected a finite number"),
+        ("csv", b"\x00\x01\x02" * 1000, "not a text; expected a CSV file"),
+        (
+            "csv",
+            ",".join(f"A.c{k}" for k in range(200_000)).encode(),
+            "200000 columns; expected one a",
+        ),
+        ("csv", b"time,A.X,A.X\n0.0,1,2\n0.1,1,2\n", "several channels are named 'X'"),
+        ("csv", b"time,A.X\n", "expected rows of 2 cells"),
+        ("csv", b"", "expected a first line that names every column"),
+        ("csv", b"time (s),A.X\n1e12,1\n1000000000001,2\n", "time '1e12': beyond the year 2262"),
+        (
+            "csv",
+            b"time,A.X\n2500-01-01T00:00:00,1\n2500-01-01T00:00:01,2\n",
+            "beyond the year 2262",
+        ),
+        ("csv", b"time,A.X\n0,1\ninf,2\n", "time 'inf': expected a finite number"),
+        ("csv", b"time,A.X\nnan,1\n1,2\n", "time 'nan': expected a finite number"),
+        ("csv", b"1,2\n3,4\n", "names every column"),
+        ("csv", b"time,X\n0,1\n1,oops\n", "oops"),
+        ("csv", b"time,X\n0,1\n1,2,3\n", "cells"),
+        ("csv", b"time,X\n0,1\n0,2\n", "always increases"),
+        ("csv", b"time,X\nnoon,1\n1,2\n", "noon"),
+        ("csv", b"time\n0\n1\n", "column of samples"),
+        ("wav", b"\x86\xa8 world \xff", "not a WAV file: it does not begin with RIFF"),
+        ("wav", _WAV, "damaged or cut off"),
+        ("wav", _WAV + _FORMAT.pack(16, 7, 1, 8000, 8000, 1, 8) + b"data\0\0\0\0", "MULAW"),
+        ("mat", b"nothing of the kind", r"a\.mat: .*MATLAB"),
+        ("mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM", r"a\.mat: .*MATLAB"),
+        ("npz", b"not a zip", "a.npz"),
     ],
 )
-def test_what_a_csv_has_wrong_is_named(tmp_path: Path, content: bytes, said: str) -> None:
-    (tmp_path / "a.csv").write_bytes(content)
-    with pytest.raises(ImportFormatError, match=said):
-        import_files([tmp_path / "a.csv"], tmp_path / "a.h5")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.csv"]
+def test_what_a_file_has_wrong_is_named(
+    tmp_path: Path, kind: str, content: bytes, said: str
+) -> None:
+    path = tmp_path / f"a.{kind}"
+    path.write_bytes(content)
+    refused(path, said)

@@ -130,39 +130,10 @@ def test_npz_rows_that_are_not_numbers_are_gaps(tmp_path: Path) -> None:
     assert sensor.first_samples() == [0, 5]
 
 
-@pytest.mark.parametrize(
-    ("arrays", "said"),
-    [
-        ({"A": np.zeros((5, 2))}, "sampling_rate"),
-        ({"A": np.zeros((5, 2)), "sampling_rate": 0.0}, "positive sampling_rate"),
-        ({"A": np.zeros((5, 2)), "sampling_rate": np.ones(2)}, "one number"),
-        ({"sampling_rate": 1.0}, "no sensors"),
-        ({"A": np.zeros((5, 2, 1)), "sampling_rate": 1.0}, r"\(n_samples, n_channels\)"),
-        ({"A": np.array(["x"]), "sampling_rate": 1.0}, "expected numbers"),
-        ({"A": np.zeros(5), "sampling_rate": 1.0, "start_time": "noon"}, "start_time"),
-    ],
-)
-def test_npz_what_is_wrong_is_said(tmp_path: Path, arrays: dict[str, Any], said: str) -> None:
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(ImportFormatError, match=said):
-        read_npz(tmp_path / "a.npz")
-
-
-def test_npz_pickles_and_other_files_are_refused(tmp_path: Path) -> None:
+def test_npz_pickles_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", sampling_rate=1.0, A=np.array([{}], dtype=object))
-    (tmp_path / "b.npz").write_text("not a zip")
-    for name in ("a.npz", "b.npz"):
-        with pytest.raises(ImportFormatError, match=name):
-            read_npz(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    "contents", [b"nothing of the kind", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"]
-)
-def test_mat_what_cannot_be_read_is_said(tmp_path: Path, contents: bytes) -> None:
-    (tmp_path / "a.mat").write_bytes(contents)
-    with pytest.raises(ImportFormatError, match=r"a\.mat: .*MATLAB"):
-        read_mat(tmp_path / "a.mat")
+    with pytest.raises(ImportFormatError, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz")
 
 
 def test_delimited_header_names_sensors_channels_and_units(tmp_path: Path) -> None:
@@ -199,22 +170,3 @@ def test_delimited_without_time_the_rate_must_be_given(tmp_path: Path) -> None:
         read_delimited(path)
     (sensor,) = read_delimited(path, 50.0)
     assert (sensor.sampling_rate, sensor.channels) == (50.0, ("X", "Y"))
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "names every column"),
-        ("1,2\n3,4\n", "names every column"),
-        ("time,X\n0,1\n1,oops\n", "oops"),
-        ("time,X\n0,1\n1,2,3\n", "cells"),
-        ("time,X\n0,1\n0,2\n", "always increases"),
-        ("time,X\nnoon,1\n1,2\n", "noon"),
-        ("time\n0\n1\n", "column of samples"),
-    ],
-)
-def test_delimited_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with pytest.raises(ImportFormatError, match=said):
-        read_delimited(path)
