@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import sqlite3
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -26,6 +25,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
+from daq.archive.documents import Documents
 from daq.archive.spectra_file import DAY_NS, Origin
 from daq.errors import ImportFormatError
 from daq.formats.readers.miniseed import contents, is_miniseed
@@ -43,10 +43,6 @@ if TYPE_CHECKING:
 
 FILE = "files.sqlite"
 """Of an archive of stations: what the headers of files say. It can be deleted."""
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS files
-    (name TEXT PRIMARY KEY, n_bytes INTEGER, modified_ns INTEGER, document TEXT);
-"""
 _NS_PER_S = 10**9
 _LEAST_SENSORS = 2
 
@@ -161,10 +157,10 @@ class FoundFiles:
     problems: list[str] = field(default_factory=list)
 
 
-class Contents:
+class Contents(Documents):
     """What the headers of miniSEED files say, kept in a database beside the stations.
 
-    Files are read again where size or time have changed. A damaged database is made again.
+    Files are read again where size or time have changed.
 
     Parameters
     ----------
@@ -173,13 +169,7 @@ class Contents:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / FILE
-        self._known: dict[str, tuple[int, int, str]] = {}
-        self._new: dict[str, tuple[int, int, str]] = {}
-        if self._path.exists():
-            with contextlib.suppress(sqlite3.Error, ValueError), self._open() as database:
-                rows = database.execute("SELECT name, n_bytes, modified_ns, document FROM files")
-                self._known = {name: (n, ns, text) for name, n, ns, text in rows}
+        super().__init__(folder / FILE)
 
     def of(self, path: Path) -> list[tuple[str, str, int, int]]:
         """Return sensor, channel, and times of the first and last sample of each stretch.
@@ -191,32 +181,12 @@ class Contents:
         """
         about = path.stat()
         state = about.st_size, about.st_mtime_ns
-        known = self._known.get(str(path))
-        if known is not None and known[:2] == state:
-            with contextlib.suppress(ValueError, TypeError):
-                return [(str(s), str(c), int(a), int(b)) for s, c, a, b in json.loads(known[2])]
+        with contextlib.suppress(ValueError, TypeError):
+            if (known := self.get(str(path), state)) is not None:
+                return [(str(s), str(c), int(a), int(b)) for s, c, a, b in known]
         found = contents(path) if is_miniseed(path) else []
-        self._new[str(path)] = (*state, json.dumps(found))
+        self.put(str(path), found, state)
         return found
-
-    def save(self) -> None:
-        """Keep what was read; nothing where the folder cannot be written."""
-        if not self._new:
-            return
-        rows = [(name, *row) for name, row in self._new.items()]
-        for _ in range(2):
-            with contextlib.suppress(OSError, sqlite3.OperationalError):
-                try:
-                    with self._open() as database, database:
-                        database.executescript(_SCHEMA)
-                        database.executemany("REPLACE INTO files VALUES (?, ?, ?, ?)", rows)
-                except sqlite3.DatabaseError:
-                    self._path.unlink(missing_ok=True)
-                    continue
-            return
-
-    def _open(self) -> contextlib.closing[sqlite3.Connection]:
-        return contextlib.closing(sqlite3.connect(self._path, timeout=10.0))
 
 
 class _Listing:

@@ -19,7 +19,7 @@ import numpy as np
 
 from daq.caveats import Caveat
 from daq.errors import NotARecordingError
-from daq.recording.file_format import fixed, texts
+from daq.recording.file_format import fixed, plain, texts
 from daq.recording.sensor_record import CommittedRows
 from daq.recording.storage.refusals import dataset
 
@@ -88,7 +88,7 @@ def damaged_tables(
 
 def result_crc32(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> int:
     """Return the checksum of a stored result."""
-    about = [[name, _plain(attributes[name])] for name in sorted(attributes)]
+    about = [[name, plain(attributes[name])] for name in sorted(attributes)]
     crc32 = zlib.crc32(json.dumps(about).encode())
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name])
@@ -116,12 +116,7 @@ def _described_sensor(group: h5py.Group) -> str:
 
 
 def _text(attributes: h5py.AttributeManager, names: tuple[str, ...]) -> str:
-    return json.dumps([[name, _plain(attributes[name])] for name in names if name in attributes])
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - any attribute
-    value = texts(value)
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return json.dumps([[name, plain(attributes[name])] for name in names if name in attributes])
 
 
 def make_checksums(file: h5py.File, n_sensors: int) -> None:

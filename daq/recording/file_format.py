@@ -153,6 +153,12 @@ def texts(value: Any) -> Any:  # noqa: ANN401 - any attribute
     return value
 
 
+def plain(value: Any) -> Any:  # noqa: ANN401 - any attribute
+    """Return an attribute as JSON has it."""
+    value = texts(value)
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
 def channel_attributes(channels: Sequence[Channel]) -> dict[str, Any]:
     """Return the attributes of the dataset ``samples`` that describe channels."""
     return {

@@ -244,9 +244,6 @@ def test_wav(tmp_path: Path, dtype: str) -> None:
     assert (sensor.name, sensor.channels, sensor.sampling_rate) == ("A", ("1", "2", "3"), 8000.0)
     zero = 128 if dtype == "uint8" else 0
     np.testing.assert_array_equal(whole(sensor), written.astype(np.float64) - zero)
-    (tmp_path / "A.wav").write_bytes(b"RIFF")
-    with pytest.raises(ImportFormatError, match="not a WAV file"):
-        open_sources([tmp_path / "A.wav"])
 
 
 def write_mat73(path: Path, **arrays: object) -> None:

@@ -201,6 +201,7 @@ def test_the_unit_of_times_without_one_is_said(
         ("csv", b"time,X\nnoon,1\n1,2\n", "noon"),
         ("csv", b"time\n0\n1\n", "column of samples"),
         ("wav", b"\x86\xa8 world \xff", "not a WAV file: it does not begin with RIFF"),
+        ("wav", b"RIFF", "not a WAV file"),
         ("wav", _WAV, "damaged or cut off"),
         ("wav", _WAV + _FORMAT.pack(16, 7, 1, 8000, 8000, 1, 8) + b"data\0\0\0\0", "MULAW"),
         ("mat", b"nothing of the kind", r"a\.mat: .*MATLAB"),
