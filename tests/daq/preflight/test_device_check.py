@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from daq.bench.loading import parse
 from daq.bench.model import Bench
 from daq.devices.registry import driver_names
 from daq.errors import NotConnectedError
@@ -115,25 +114,10 @@ async def test_bandwidth_of_polled_sensors_follows_from_the_longest_interval(
 
 
 async def test_failing_ports_do_not_hide_the_others(running: tuple[RunningDevice, ...]) -> None:
-    bench = parse(
-        f"""
-        name = "bench"
-        sampling_rate = 200.0
-
-        [[sensors]]
-        name = "A"
-        driver = "epson"
-        port = "{running[0].port}"
-        channels = [{{name = "x", sensitivity = 1.7e6}}]
-
-        [[sensors]]
-        name = "B"
-        driver = "epson"
-        port = "/dev/ttyNotThere"
-        channels = [{{name = "x", sensitivity = 1.7e6}}]
-        """,
-        "bench.toml",
-    )
+    bench = bench_of(running[0], TABLES[0])
+    (a,) = bench.sensors
+    gone = a.model_copy(update={"name": "B", "port": "/dev/ttyNotThere"})
+    bench = bench.model_copy(update={"sensors": (a, gone)})
     examined = await examine(bench, CLOCK, seconds=0.1)
     assert [check.information.sensor for check in examined.found] == ["A"]
     assert ["'B' on /dev/ttyNotThere" in str(error) for error in examined.errors] == [True]
@@ -154,35 +138,18 @@ async def test_devices_on_a_port_are_discovered(running: tuple[RunningDevice, ..
 async def test_silent_or_wrong_devices_do_not_hide_others_on_their_port(
     running: tuple[RunningDevice, ...],
 ) -> None:
-    port, names = running[1].port, ("P", "Q")
-    sensors_ = "".join(
-        f"""
-        [[sensors]]
-        name = "{name}"
-        driver = "registers"
-        port = "{port}"
-        channels = [{{name = "x", sensitivity = 2e5}}]
-        settings = {{preset = "witmotion", device_id = {80 + k}, timeout = 0.2}}
-        """
-        for k, name in enumerate(names)
-    )
-    sensors_ += f"""
-        [[sensors]]
-        name = "A"
-        driver = "epson"
-        port = "{running[0].port}"
-        serial_number = "another"
-        sampling_rate = 200.0
-        channels = [{{name = "x", sensitivity = 1.7e6}}]
-        """
-    bench = parse(f'name = "b"\nsampling_rate = {RATE}\n{sensors_}', "bench.toml")
+    settings = {"preset": "witmotion", "device_id": 80, "timeout": 0.2}
+    (p,) = sensors(running[1], POLLED, settings=settings)
+    q = p.model_copy(update={"name": "Q", "settings": settings | {"device_id": 81}})
+    (a,) = sensors(running[0], TABLES[0], serial_number="another")
+    bench = Bench(name="b", sampling_rate=RATE, sensors=(p, q, a))
     examined = await examine(bench, CLOCK, seconds=0.2)
     assert "P" in [check.information.sensor for check in examined.found]
     said = sorted(str(error) for error in examined.errors)
     assert len(said) == 2
     assert "'A'" in said[0]
     assert "serial number 'another', got 'A0000007'" in said[0]
-    assert "'Q': expected registers 48 to 52 (0x0030 to 0x0034) of device 81" in said[1]
+    assert "'Q': expected registers 48 to 54 (0x0030 to 0x0036) of device 81" in said[1]
 
 
 def test_the_search_is_described() -> None:
