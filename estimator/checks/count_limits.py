@@ -147,21 +147,25 @@ class CountLimits:
         columns : mapping of int to bool, shape (n_samples,)
             Channels to look at, with the rows to use of each.
         """
-        columns = {n: rows & np.isfinite(counts[:, n]) for n, rows in columns.items()}
-        values = {column: counts[rows, column] for column, rows in columns.items() if rows.any()}
+        values, every = {}, np.ones(len(counts), np.bool_)
+        for n, rows in columns.items():
+            known = rows & np.isfinite(counts[:, n])
+            if known.any():
+                values[n] = counts[known, n] if not known.all() else counts[:, n].copy()
+            every &= known
         wrapped = {n: found for n, own in values.items() if (found := wraps(own)) is not None}
         ordered = {n: np.sort(own) for n, own in values.items()}
         clipped = {
             n: share for n, own in values.items() if (share := share_at_ends(own, ordered[n]))
         }
-        known = {n: codes(own) for n, own in ordered.items()}
-        rows = np.all(list(columns.values()), axis=0) if columns else np.zeros(len(counts), bool)
-        share = share_of_repeats(counts[rows][:, list(columns)])
+        of_codes = {n: codes(own) for n, own in ordered.items()}
+        together = counts if every.all() else counts[every]
+        share = share_of_repeats(together[:, list(columns)]) if columns else 0.0
         return cls(
             {n: part for n, part in clipped.items() if n not in wrapped},
             wrapped,
             dict.fromkeys(values, share) if share else {},
-            {n: one for n, one in known.items() if one is not None and not one.are_complete},
+            {n: one for n, one in of_codes.items() if one is not None and not one.are_complete},
         )
 
     @classmethod
@@ -387,8 +391,9 @@ def share_of_repeats(counts: NDArray[Any]) -> float:
     """
     if len(counts) < 2 * MIN_REPEATS:
         return 0.0
-    steps = np.abs(np.diff(counts.astype(np.float64), axis=0))
-    is_equal = np.asarray(~steps.any(axis=1))
+    is_equal = np.ones(len(counts) - 1, np.bool_)
+    for column in counts.T:
+        is_equal &= column[1:] == column[:-1]
     n_equal = int(is_equal.sum())
     changes = np.flatnonzero(~is_equal)
     if n_equal < MIN_REPEATS or len(changes) < MIN_REPEATS:
@@ -396,6 +401,7 @@ def share_of_repeats(counts: NDArray[Any]) -> float:
     intervals = np.diff(changes)
     if intervals.std() > EVEN * intervals.mean():
         return 0.0
+    steps = np.abs(np.diff(counts.astype(np.float64), axis=0))
     shown = any(_repeats_by_more_than_chance(column, is_equal) for column in steps.T)
     return n_equal / len(steps) if shown else 0.0
 

@@ -99,17 +99,19 @@ class SquaresAndCubes:
 
     def add(self, samples: FloatArray) -> None:
         """Add a segment, (segment_length, n_channels), unless it is disturbed."""
-        centred = samples - samples.mean(axis=0)
-        size = np.sqrt(np.mean(centred**2, axis=0))
-        if not np.all(size > 0) or np.any(np.abs(centred) > PEAK * size):
+        centred = samples.T - samples.mean(axis=0)[:, None]
+        size = np.sqrt(np.mean(centred**2, axis=1))
+        if not np.all(size > 0) or np.any(np.abs(centred).max(axis=1) > PEAK * size):
             return
         if self._scale is None:
             self._scale = size
-        x = centred / self._scale
-        power = (self._window**2 @ x**2) / (self._window @ self._window)
-        terms = np.stack([x, x**2, x * (x**2 - 3 * power)], axis=-1)
-        spectra = np.fft.rfft(terms * self._window[:, None, None], axis=0)[self.bins]
-        self._spectra.append(spectra.astype(np.complex64))
+        x = centred / self._scale[:, None]
+        square = x**2
+        power = (square @ self._window**2) / (self._window @ self._window)
+        terms = np.stack([x, square, x * (square - 3 * power[:, None])])
+        terms *= self._window
+        spectra = np.fft.rfft(terms)[:, :, self.bins]
+        self._spectra.append(spectra.astype(np.complex64).transpose(2, 1, 0))
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
@@ -159,14 +161,15 @@ def _worst(
     wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
     rest = _without(predictors.astype(np.complex128), wanted.astype(np.complex128))
     rest = rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS)
-    found = []
-    for n, channel in enumerate(own):
-        evidence, explained = _explained(rest[:, :, n], block, left)
-        unexplained = np.sum(np.abs(rest[:, :, n, 0]) ** 2) / left - explained.sum()
-        power = np.sum(np.abs(spectra[:, :, channel, 0]) ** 2) / len(spectra)
-        if power > LOUD * unexplained and evidence > CERTAIN:
-            share = float(explained.sum() / power)
-            found.append(Nonlinear(channel, evidence, share, explained))
+    evidence, explained = _explained(rest, block, left)
+    of_squares = explained.sum(axis=0)
+    unexplained = (np.abs(rest[..., 0]) ** 2).sum(axis=(0, 1)) / left - of_squares
+    power = (np.abs(spectra[:, :, own, 0]) ** 2).sum(axis=(0, 1)) / len(spectra)
+    found = [
+        Nonlinear(channel, float(evidence[n]), float(of_squares[n] / power[n]), explained[:, n])
+        for n, channel in enumerate(own)
+        if power[n] > LOUD * unexplained[n] and evidence[n] > CERTAIN
+    ]
     return max(found, key=lambda each: each.share, default=None)
 
 
@@ -176,42 +179,42 @@ def _without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
     return np.asarray(wanted - basis @ (basis.conj().swapaxes(1, 2) @ wanted))
 
 
-def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[float, FloatArray]:
-    """Return the evidence of square and cube, and the power that they explain, (n_freqs,).
+def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[FloatArray, FloatArray]:
+    """Return the evidence of square and cube, (n,), and the power that they explain, (n_freqs, n).
 
-    `rest` has the shape (n_freqs, n_segments, 3): what others leave of the channel and of both.
+    `rest` has the shape (n_freqs, n_segments, n, 3): what others leave of n channels and of both.
     """
-    r, q = rest[:, :, 0], rest[:, :, 1:]
+    r, q = rest[..., 0], rest[..., 1:]
     n = r.shape[1]
     first = np.flatnonzero(np.diff(block, prepend=-1))
     size = np.sqrt(np.add.reduceat(np.sum(np.abs(q) ** 2, axis=1), first))
     q /= np.where(size > 0, size, 1.0)[block, None]
     variance = np.sum(np.abs(r) ** 2, axis=1) / left
     weight = 1 / np.maximum(variance, np.finfo(np.float64).tiny)
-    u = np.add.reduceat(q.conj() * r[:, :, None] * weight[:, None, None], first)
-    U, V = u.sum(axis=1), np.einsum("bki,bkj->bij", u, u.conj())
-    G = np.einsum("fki,fkj->fij", q.conj(), q)
-    A = np.add.reduceat(G * weight[:, None, None], first)
-    coefficient = np.linalg.solve(A, U[:, :, None])[:, :, 0]
-    share = np.einsum("bi,bi->b", U.conj(), np.linalg.solve(V, U[:, :, None])[:, :, 0]).real / n
+    u = np.add.reduceat(q.conj() * (r * weight[:, None])[..., None], first)
+    U, V = u.sum(axis=1), np.einsum("bkci,bkcj->bcij", u, u.conj())
+    G = np.einsum("fkci,fkcj->fcij", q.conj(), q)
+    A = np.add.reduceat(G * weight[..., None, None], first)
+    coefficient = np.linalg.solve(A, U[..., None])[..., 0]
+    share = (U.conj() * np.linalg.solve(V, U[..., None])[..., 0]).real.sum(axis=2) / n
     share = np.clip(share * left / n, 0.0, 1 - 1e-9)
     degrees = left - _TERMS
     # P(Beta(2, degrees) > share); their logarithms add up (Fisher)
     log_p = degrees * np.log1p(-share) + np.log1p(degrees * share)
     half = len(first)  # degrees of freedom of -2 sum(log p), halved
-    evidence = _normal(-float(log_p.sum()) / half, half)
-    total = np.einsum("bi,bi->b", U.conj(), coefficient).real
-    chance = np.einsum("bii->b", np.linalg.solve(A, V)).real
+    evidence = _normal(-log_p.sum(axis=0) / half, half)
+    total = (U.conj() * coefficient).real.sum(axis=2)
+    chance = np.einsum("bcii->bc", np.linalg.solve(A, V)).real
     true = np.maximum(1 - chance / np.maximum(total, 1e-300), 0.0)[block]
     c = coefficient[block]
-    power = np.einsum("fi,fij,fj->f", c.conj(), G, c).real / left
+    power = np.einsum("fci,fcij,fcj->fc", c.conj(), G, c).real / left
     return evidence, true * power
 
 
-def _normal(ratio: float, half: int) -> float:
+def _normal(ratio: FloatArray, half: int) -> FloatArray:
     """Return a chi-squared variable of 2 `half` degrees of freedom, over these, as a normal one.
 
     By Wilson and Hilferty.
     """
     spread = 2 / (9 * 2 * half)
-    return float((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread))
+    return np.asarray((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread))

@@ -29,14 +29,14 @@ def limits_of(record: ReadableSensor, unused: NDArray[np.float64] | None = None)
     if len(rows) == 0:
         return CountLimits()
     counts = np.concatenate([record.intact_counts(int(a), int(b))[0] for a, b in rows])
-    which = np.concatenate([np.arange(first, last) for first, last in rows])
-    blocks = record.blocks
-    begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
-    block = np.searchsorted(begins, which, side="right") - 1
-    kept = blocks["flags"][block] & int(BlockFlag.CLIPPED) == 0
-    used = np.repeat(kept[:, None], counts.shape[1], axis=1)
-    for column, begin, end in record.absent:
-        used[(which >= begin) & (which < end), column] = False
+    used, blocks = np.ones(counts.shape, dtype=np.bool_), record.blocks
+    clipped = blocks["flags"] & int(BlockFlag.CLIPPED) != 0
+    if clipped.any() or len(record.absent):
+        which = np.concatenate([np.arange(first, last) for first, last in rows])
+        begins = np.concatenate([[0], np.cumsum(blocks["n_samples"])])[:-1]
+        used[clipped[np.searchsorted(begins, which, side="right") - 1]] = False
+        for column, begin, end in record.absent:
+            used[(which >= begin) & (which < end), column] = False
     main = [n for n, channel in enumerate(record.channels) if not channel.auxiliary]
     return CountLimits.of(counts, {n: used[:, n] for n in main if used[:, n].any()})
 
