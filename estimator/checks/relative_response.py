@@ -569,11 +569,12 @@ def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
     place = np.rint((f - f[0]) / step).astype(np.int64)
     # eight delays per period of the highest frequency resolve every peak
     n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
-    spectrum = np.zeros((n, *transfer.shape[1:]), np.complex128)
-    np.add.at(spectrum, place, transfer)
+    flat = transfer.reshape(len(f), -1).T
+    spectra = np.zeros((len(flat), n), np.complex128)
+    spectra[:, place] = flat  # as frequencies are a step apart at least
     delays = np.fft.fftfreq(n, step)
-    total = np.fft.ifft(spectrum, axis=0) * np.exp(2j * np.pi * f[0] * delays)[:, None, None]
-    return float(delays[np.argmax((total.real**2).sum(axis=(1, 2)))])
+    total = np.fft.ifft(spectra) * np.exp(2j * np.pi * f[0] * delays)
+    return float(delays[np.argmax((total.real**2).sum(axis=0))])
 
 
 def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None:

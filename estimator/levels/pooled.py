@@ -44,6 +44,7 @@ from estimator.levels.noise_matrices import (
     are_many,
     axes_of,
     inverse_of_sensors,
+    largest_eigenvalue,
     leading,
     mean_coupling,
     of_sensors,
@@ -806,9 +807,9 @@ def _edge(p: int, parts: _Parts) -> FloatArray:
 
 def _kept(U: ComplexArray, own: list[IntArray]) -> FloatArray:
     """Return the least share of a direction of the noise of one sensor that is not taken."""
-    P = np.eye(U.shape[1]) - U @ U.conj().swapaxes(1, 2)
-    least = [np.linalg.eigvalsh(P[:, c[:, None], c])[:, 0] for c in own]
-    return np.asarray(np.min(least, axis=0))
+    taken = U @ U.conj().swapaxes(1, 2)
+    most = [largest_eigenvalue(taken[:, c[:, None], c]) for c in own]
+    return np.asarray(1 - np.max(most, axis=0))
 
 
 def _nearest(seen: BoolArray, parts: _Parts) -> IntArray:
