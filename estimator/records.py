@@ -9,6 +9,7 @@ all. Instances take a few microseconds longer to make: hot loops have no use for
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError
@@ -28,7 +29,8 @@ NOT_IN_JSON: Mapping[str, None] = {"key": None}
 _CAPITAL = re.compile(r"(?<!^)(?=[A-Z])")
 _UNIT = re.compile(rf"\b({'|'.join(UNITS)})\b")
 
-_MADE = ("__init__", "__repr__", "__setattr__", "__delattr__", "__getstate__", "__setstate__")
+_MADE = ("__init__", "__repr__", "__getstate__", "__setstate__")
+_FROZEN = ("__setattr__", "__delattr__")
 _COMPARED = ("__eq__", "__hash__")
 
 
@@ -50,9 +52,10 @@ class Record:
                     value = named.pop(each.name, each.default)
             if value is MISSING and each.default_factory is not MISSING:
                 value = each.default_factory()
-            if value is MISSING:
+            if value is not MISSING:
+                object.__setattr__(self, each.name, value)
+            elif each.init:
                 raise TypeError(f"{type(self).__name__} without {each.name}")
-            object.__setattr__(self, each.name, value)
         named |= {repr(each): each for each in placed}
         if named:
             raise TypeError(f"{type(self).__name__} has no {', '.join(named)}")
@@ -85,6 +88,24 @@ class Record:
             object.__setattr__(self, name, value)
 
 
+class _Fields:
+    """Fields of a class as `dataclasses` finds them, when they are asked for: most never are.
+
+    `kind` is the class as it is written, `of` the one that has its fields, if that is another.
+    """
+
+    def __init__(self, kind: type, of: type, *, kw_only: bool = False) -> None:
+        self._kind, self._of, self._kw_only = kind, of, kw_only
+
+    def __get__(self, made: object, owner: type) -> Mapping[str, Field[Any]]:
+        about = dataclasses.dataclass(init=False, repr=False, eq=False, kw_only=self._kw_only)
+        about(self._kind)
+        for name in ("__dataclass_fields__", "__dataclass_params__"):
+            setattr(self._of, name, self._kind.__dict__[name])
+        found: Mapping[str, Field[Any]] = self._kind.__dict__["__dataclass_fields__"]
+        return found
+
+
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class Kind(Record):
     """Base of records of which each subclass is a kind, and made by keywords only.
@@ -99,21 +120,36 @@ class Kind(Record):
 
     def __init_subclass__(cls) -> None:
         cls.name = _CAPITAL.sub("-", cls.__name__).lower()
-        dataclasses.dataclass(kw_only=True, init=False, repr=False, eq=False)(cls)
+        cls.__dataclass_fields__ = _Fields(cls, cls, kw_only=True)  # type: ignore[attr-defined]
 
 
 if TYPE_CHECKING:
     from dataclasses import dataclass as dataclass  # noqa: PLC0414 - for others, too
 else:
 
-    def dataclass(*, slots: bool = False, eq: bool = True, **_: bool) -> Callable[[type], type]:
-        """Stand in for the one of `dataclasses` where it is ``frozen``."""
+    def dataclass(
+        *, slots: bool = False, eq: bool = True, frozen: bool = False, **_: bool
+    ) -> Callable[[type], type]:
+        """Stand in for the one of `dataclasses`, with fields in order."""
 
         def made(kind: type) -> type:
-            for name in _MADE + _COMPARED * eq:
+            for name in _MADE + _FROZEN * frozen + _COMPARED * eq:
                 if name not in kind.__dict__:
                     setattr(kind, name, Record.__dict__[name])
-            return dataclasses.dataclass(slots=slots, init=False, repr=False, eq=False)(kind)
+            if eq and not frozen:
+                kind.__hash__ = None
+            found = kind
+            if slots:
+                types = inspect.get_annotations(kind)
+                own = [name for name, of in types.items() if "ClassVar" not in str(of)]
+                known = {slot for base in kind.__mro__ for slot in getattr(base, "__slots__", ())}
+                lacks = {*own, "__dict__", "__weakref__"}
+                members = {name: of for name, of in kind.__dict__.items() if name not in lacks}
+                members["__slots__"] = tuple(name for name in own if name not in known)
+                found = type(kind)(kind.__name__, kind.__bases__, members)
+                found.__qualname__ = kind.__qualname__
+            found.__dataclass_fields__ = _Fields(kind, found)
+            return found
 
         return made
 

@@ -34,7 +34,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,7 @@ from daq.clocks.quantiles import median
 from daq.clocks.slips import Slips
 from daq.clocks.usb_polling import BEATS_PER_WINDOW, Polls, shows
 from daq.protocols.block import BlockFlag
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

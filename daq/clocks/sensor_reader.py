@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
@@ -27,6 +27,7 @@ from daq.clocks.slips import Slips
 from daq.errors import CannotAlignError
 from daq.protocols.block import BlockFlag, Uncounted
 from daq.recording.interface import ReadableSensor, absences
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

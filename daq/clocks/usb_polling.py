@@ -15,12 +15,13 @@ consecutive blocks are looked at, spread over the recording.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.clocks.quantiles import median, quantile
+from estimator.records import dataclass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

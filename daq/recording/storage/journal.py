@@ -24,7 +24,7 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from daq.recording.storage.refusals import MAX_CHUNK
 from daq.recording.storage.retries import repeated
 from daq.recording.storage.superblock import Superblock
 from daq.recording.storage.whole_hdf5 import WholeHdf5
+from estimator.records import dataclass
 
 _MAGIC = b"huddle-journal 1\n"
 _FRAME = struct.Struct("<II")
