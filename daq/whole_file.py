@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
-import hashlib
 import io
 import os
 import shutil
@@ -153,6 +152,8 @@ def written(
     OSError
         If it cannot be written, or the disk has other bytes than were written.
     """
+    import hashlib  # noqa: PLC0415 - takes 3 ms, and most commands write no file
+
     if path.is_file():
         mode = stat.S_IMODE(path.stat().st_mode)
     with replaced(path, free=free) as part:

@@ -14,7 +14,6 @@ by more than chance.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -116,7 +115,7 @@ class Equalisation:
         self._factor = slope_factor(window, welch.sampling_rate)
         known = mode in {"auto", "known"} and len(channels) > 1
         self.known = self._by_bench(channels) if known else None
-        self._found: tuple[tuple[tuple[float, bytes], ...], _Leaks | None] = (), None
+        self._found: tuple[tuple[tuple[float, int], ...], _Leaks | None] = (), None
         self._can_estimate = mode in {"auto", "estimated"} and welch.segment_length % 2 == 0
         self.is_settled = not self._can_estimate or len(dims) < 3
         self.reset()
@@ -424,12 +423,9 @@ def _by_all_others(band: Band, dims: tuple[int, ...]) -> SelfNoise | None:
     return SelfNoise.of(METHOD, level, cumulants, np.zeros(level.shape, np.int64))
 
 
-def _key(bands: Sequence[Band]) -> tuple[tuple[float, bytes], ...]:
+def _key(bands: Sequence[Band]) -> tuple[tuple[float, int], ...]:
     """Return what tells averages from others, without keeping them."""
-    return tuple(
-        (band.n_effective, hashlib.sha256(np.ascontiguousarray(band.csm).ravel().data).digest())
-        for band in bands
-    )
+    return tuple((band.n_effective, hash(band.csm.tobytes())) for band in bands)
 
 
 def _held(response: ComplexArray) -> ComplexArray:

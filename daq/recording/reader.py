@@ -26,7 +26,6 @@ from daq.recording.description import damaged_tables, result_crc32
 from daq.recording.file_format import SIMULATED
 from daq.recording.sensor_record import CommittedRows, SensorRecord
 from daq.recording.storage import trial
-from daq.recording.storage.journal import journal_path
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import CONTINUES
 from daq.recording.storage.opening import open_file, refresh, source_of
@@ -134,6 +133,8 @@ class Recording:
                 file.close()
                 raise
         except NotARecordingError as error:
+            from daq.recording.storage.journal import journal_path  # noqa: PLC0415 - seldom needed
+
             if not journal_path(path).exists():
                 raise
             raise NotARecordingError(

@@ -20,8 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
-from hashlib import sha256
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +34,7 @@ from estimator.levels.noise_matrices import (
     pairs,
     solved,
 )
+from estimator.records import dataclass
 from estimator.self_noise.coherency import TOLERANCE, blocks
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -302,7 +302,7 @@ class Maxima:
     """
 
     def __init__(self) -> None:
-        self._found: dict[tuple[int, tuple[int, ...] | None, bytes], tuple[Maximum, int]] = {}
+        self._found: dict[tuple[int, tuple[int, ...] | None, int], tuple[Maximum, int]] = {}
         self._bytes = 0
 
     def maximise(
@@ -314,7 +314,7 @@ class Maxima:
     ) -> Maximum:
         """Return `maximise` without a penalty, of some matrices perhaps from before."""
         keys = [  # no minus zeros
-            (n_factors, dims, sha256(np.add(each, 0.0, order="C").data).digest()) for each in csm
+            (n_factors, dims, hash(each.tobytes())) for each in np.add(csm, 0.0, order="C")
         ]
         before = [self._found.get(key) for key in keys]
         missing = [row for row, each in enumerate(before) if each is None]

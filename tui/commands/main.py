@@ -150,6 +150,7 @@ def _spare_the_processor() -> None:
     # The matrices are small: BLAS's own threads would only wait for each other, at full load.
     for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    import_module("daq.estimation.blas_threads")  # which sees that they are set
     # Plug-ins would be looked for in every installed package.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Imports make many objects, all of which stay: cycles are not searched for among them, neither

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Generator
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +14,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from daq.archive.task import Task, run, software_version
-from daq.estimation.blas_threads import one_blas_thread
+from daq.estimation.blas_threads import VARIABLES, one_blas_thread
 from daq.estimation.estimation import Estimation
 from tests.daq.clocks.recordings import write
 from tests.daq.estimation.test_estimation import SETTINGS, huddle
@@ -36,6 +39,21 @@ def test_an_estimate_has_one_thread_and_leaves_the_number(tmp_path: Path, take: 
     assert seen
     assert all(each == {1} for each in seen)
     assert n_threads() == {2}
+
+
+def test_a_command_begins_with_one_thread_and_looks_for_no_library() -> None:
+    program = (
+        "import sys; from daq.estimation.blas_threads import one_blas_thread\n"
+        "import numpy\n"
+        "with one_blas_thread(): print('threadpoolctl' in sys.modules)\n"
+        "from threadpoolctl import threadpool_info\n"
+        "print({each['num_threads'] for each in threadpool_info()})"
+    )
+    one = os.environ | dict.fromkeys(VARIABLES, "1")
+    shown = subprocess.run(
+        [sys.executable, "-c", program], check=True, capture_output=True, text=True, env=one
+    ).stdout
+    assert shown.split() == ["False", "{1}"]
 
 
 def test_an_archive_task_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import socket
 import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from typing import Any
 
 from tui.output.console import notices, reserve_standard_error
 from tui.output.logs.options import LogFormat, LogLevel
-from tui.output.plain_console import SHOWN_CONTROLS
+from tui.page.table import SHOWN_CONTROLS
 
 OWN_LOGGERS = ("daq", "estimator", "sim_devices", "tui", "huddle")
 """Packages that log from the chosen level on; others log from WARNING on."""
@@ -245,6 +244,8 @@ class JournalHandler(logging.Handler):
     """
 
     def __init__(self, fields_of: Any, address: str = ADDRESS) -> None:  # noqa: ANN401 - a function
+        import socket
+
         super().__init__()
         self._fields_of = fields_of
         self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
