@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, FrozenInstanceError
 from functools import cache
+from threading import RLock
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeAlias, dataclass_transform
 
 Seconds: TypeAlias = float
@@ -34,6 +35,7 @@ _FROZEN = ("__setattr__", "__delattr__")
 _COMPARED = ("__eq__", "__hash__")
 
 
+_FINDING = RLock()
 _fields: Callable[[type], tuple[Field[Any], ...]] = cache(dataclasses.fields)
 
 
@@ -97,13 +99,16 @@ class _Fields:
     def __init__(self, kind: type, of: type, *, kw_only: bool = False) -> None:
         self._kind, self._of, self._kw_only = kind, of, kw_only
 
-    def __get__(self, made: object, owner: type) -> Mapping[str, Field[Any]]:
-        about = dataclasses.dataclass(init=False, repr=False, eq=False, kw_only=self._kw_only)
-        about(self._kind)
-        for name in ("__dataclass_fields__", "__dataclass_params__"):
-            setattr(self._of, name, self._kind.__dict__[name])
-        found: Mapping[str, Field[Any]] = self._kind.__dict__["__dataclass_fields__"]
-        return found
+    def __get__(self, made: object, owner: type) -> Any:  # noqa: ANN401 - of `dataclasses`
+        with _FINDING:  # a class is changed by it: another thread must not begin with that
+            found: Any = self._kind.__dict__.get("__dataclass_fields__", self)
+            if found is self:
+                about = {"init": False, "repr": False, "eq": False, "kw_only": self._kw_only}
+                dataclasses.dataclass(**about)(self._kind)
+                found = self._kind.__dict__["__dataclass_fields__"]
+                self._of.__dataclass_params__ = self._kind.__dataclass_params__
+                self._of.__dataclass_fields__ = found
+            return found
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
