@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -28,7 +27,7 @@ from tui.output.exit_codes import ExitCode
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.console import Console
+    from rich.console import Console, RenderableType
 
     from daq.results.decision.verdict import TestVerdict
     from daq.results.noise_parameters import ChannelParameters
@@ -155,6 +154,8 @@ def _of_foreign_files(
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> Result:
     """Estimate files of other programs as if they were imported, without a recording."""
+    from tempfile import TemporaryDirectory
+
     from daq.errors import ImportFormatError
     from daq.estimation.estimation import estimate
     from daq.formats.defaults import from_files, still_chosen
@@ -232,10 +233,8 @@ def show_result(
     """Print the table, and write JSON and CSV if requested."""
     from daq.results.noise_parameters import quantisation_shares
     from estimator.decision.verdict import Verdict
-    from tui.output.diagnosis import details
     from tui.output.noise_parameters import quantisation_notes
     from tui.output.results import averages_line, curves_csv, result_table, result_title
-    from tui.output.standing import standing
     from tui.wording.verdict_text import STYLES, Decision, facts_below, limit_line
 
     snapshot, screen = result.snapshot, for_people(json, csv)
@@ -250,9 +249,7 @@ def show_result(
         screen.print(line)
     if parameters is not None:
         _show_parameters(screen, parameters, snapshot.unit)
-    for part in details(snapshot, result.facts) if diagnostics else facts_below(result):
-        screen.print(part)
-    for part in standing(result, width=screen.width) if diagnostics else ():
+    for part in _details(result, screen.width) if diagnostics else facts_below(result):
         screen.print(part)
     for each in () if result.verdict is None else result.verdict.limits:
         if each.verdict is not Verdict.PASS:
@@ -270,6 +267,14 @@ def show_result(
             from tui.output.json_document import provenance
 
             write_metadata(Path(csv), provenance(result))
+
+
+def _details(result: Result, width: int) -> Sequence[RenderableType]:
+    """Return the whole diagnosis, and how the sensors stand."""
+    from tui.output.diagnosis import details
+    from tui.output.standing import standing
+
+    return details(result.snapshot, result.facts) + standing(result, width=width)
 
 
 def _show_parameters(screen: Console, found: Sequence[ChannelParameters], unit: str) -> None:

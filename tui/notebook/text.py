@@ -14,7 +14,7 @@ from tui.output.results import averages_line, result_table, result_title
 from tui.page import html as page
 from tui.page.blocks import Paragraph, Part
 from tui.page.table import Table
-from tui.page.terminal import terminal_table
+from tui.page.terminal import styled, terminal_table
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import Decision, facts_below
 
@@ -33,7 +33,7 @@ def text(result: Result) -> str:
     try:
         parts: list[RenderableType | Table] = [
             *(Text(line) for line in _decision(result)),
-            result_title(result),
+            styled(result_title(result)),
             Text(averages_line(result.snapshot)),
             result_table(result),
         ]
@@ -51,7 +51,7 @@ def _decision(result: Result) -> list[str]:
 def html(result: Result) -> str:
     """Return the table that ``huddle estimate`` prints, as HTML."""
     try:
-        table = replace(result_table(result), title=result_title(result).plain)
+        table = replace(result_table(result), title=str(result_title(result)))
     except BandError as error:
         return page.html(Paragraph(f"Self-noise: {error}"))
     below = (averages_line(result.snapshot), *(each.line for each in result.facts))

@@ -6,15 +6,17 @@ otherwise be taken for markup and emoji. Colour is asked for with ``style=`` or 
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import typer
 
 from daq.whole_file import written
+from tui.page.table import WIDTH_OF_TABLES, Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -27,7 +29,73 @@ _SPEED_PERIOD = 3600.0
 """Seconds over which the time left is predicted: a step may take many minutes."""
 WIDTH_OF_FILES = 110
 """Columns of bars and rules that go into a file or a pipe."""
+_NARROW = frozenset("−²³±→▲△✓✗…–—·≤≥µ°σΔ’")
+"""Characters of one column, of those above U+02FF."""
+_FORCED = {"FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"}
 _for_json = False
+
+
+class FileConsole:
+    """Prints texts and tables into files and pipes, which Rich would take 40 ms for.
+
+    What else there is to a console is that of Rich, which is loaded then.
+    """
+
+    is_terminal, width = False, WIDTH_OF_FILES
+
+    def __init__(self, *, stderr: bool, quiet: bool) -> None:
+        self.stderr, self.quiet = stderr, quiet
+
+    @property
+    def file(self) -> TextIO:
+        """Where it prints: standard output or standard error, as it is now."""
+        return sys.stderr if self.stderr else sys.stdout
+
+    @cached_property
+    def _rich(self) -> Console:
+        return _by_rich(self.width, stderr=self.stderr, quiet=self.quiet)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - of any kind
+        return getattr(self._rich, name)
+
+    def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401 - as that of Rich
+        """Print texts and tables, each row and paragraph on one line."""
+        known = len(objects) == 1 and options.keys() <= {"style", "soft_wrap"}
+        text = _in_file(objects[0]) if known else None
+        if text is None:
+            self._rich.print(*objects, **options)
+        elif not self.quiet:
+            self.file.write(f"{text}\n")
+            self.file.flush()
+
+
+def _in_file(shown: object) -> str | None:
+    """Return a text or a table as it is in a file; None if Rich must lay it out."""
+    if isinstance(shown, str):
+        rows: list[tuple[str, ...]] = [(shown,)]
+    elif isinstance(shown, Table) and not shown.title:
+        rows = [shown.header] * any(shown.header) + list(shown.rows)
+    else:
+        return None
+    letters = {letter for row in rows for cell in row for letter in cell}
+    if isinstance(shown, str):
+        letters.discard("\n")
+    if not all(each.isprintable() and (each < "\u0300" or each in _NARROW) for each in letters):
+        return None
+    if isinstance(shown, str):
+        return shown
+    n_columns = max(map(len, rows), default=0)
+    rows = [row + ("",) * (n_columns - len(row)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    if sum(widths) + 2 * n_columns > WIDTH_OF_TABLES:
+        return None
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if number in shown.left else cell.rjust(width)
+            for number, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )
 
 
 def console() -> Console:
@@ -42,9 +110,14 @@ def notices() -> Console:
 
 
 def _plain(stream: TextIO, *, stderr: bool = False, quiet: bool = False) -> Console:
-    from tui.output.plain_console import PlainConsole  # noqa: PLC0415 - help needs no Rich
+    if stream.isatty() or not _FORCED.isdisjoint(os.environ):  # as Rich decides
+        return _by_rich(None if stream.isatty() else WIDTH_OF_FILES, stderr=stderr, quiet=quiet)
+    return cast("Console", FileConsole(stderr=stderr, quiet=quiet))
 
-    width = None if stream.isatty() else WIDTH_OF_FILES
+
+def _by_rich(width: int | None, *, stderr: bool, quiet: bool) -> Console:
+    from tui.output.plain_console import PlainConsole  # noqa: PLC0415 - files need no Rich
+
     return PlainConsole(
         stderr=stderr, quiet=quiet, highlight=False, markup=False, emoji=False, width=width
     )

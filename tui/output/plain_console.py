@@ -11,14 +11,8 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
 from tui.output.exit_codes import ExitCode
-from tui.page.table import Table
-from tui.page.terminal import terminal_table
-
-WIDTH_OF_TABLES = 2000
-"""Columns that a table in a file or a pipe may need."""
-SHOWN_CONTROLS = {
-    code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
-}
+from tui.page.table import SHOWN_CONTROLS, WIDTH_OF_TABLES, Cell, Table
+from tui.page.terminal import styled, terminal_table
 
 
 class PlainConsole(Console):
@@ -29,7 +23,8 @@ class PlainConsole(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: ANN401 - the library's own
         """Print texts and tables; unbroken where no terminal shows them."""
-        shown = [terminal_table(one) if isinstance(one, Table) else one for one in objects]
+        shown = [styled(one) if isinstance(one, Cell) else one for one in objects]
+        shown = [terminal_table(one) if isinstance(one, Table) else one for one in shown]
         if self.is_terminal:
             super().print(*shown, **options)
             return

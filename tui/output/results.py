@@ -6,14 +6,13 @@ import io
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.text import Text
 
 from daq.results.band_summary import data_interval
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.self_noise.result import Flag
 from estimator.wording import clock_time, several
 from tui.output.curves import CURVES
-from tui.page.table import Table
+from tui.page.table import Cell, Table
 from tui.wording.formatting import level, level_with_error, utc
 
 if TYPE_CHECKING:
@@ -21,16 +20,15 @@ if TYPE_CHECKING:
     from daq.results.result import Result
 
 
-def result_title(result: Result) -> Text:
+def result_title(result: Result) -> Cell:
     """Return the title of the table of results."""
     low, high = result.band
     wanted = high if result.settings.band is None else result.settings.band[1]
     asked = f" ({wanted:.3g} requested)" if wanted > high else ""
     what = "Self-noise" if result.snapshot.results else "PSD of the recorded signals"
-    return Text.assemble(
-        (f"{what}, mean over {low:.3g} to {high:.3g} Hz", "bold"),
-        f"{asked}, dB re 1 ({result.snapshot.unit})²/Hz, with its 95 % interval",
-    )
+    text = f"{what}, mean over {low:.3g} to {high:.3g} Hz"
+    more = f"{asked}, dB re 1 ({result.snapshot.unit})²/Hz, with its 95 % interval"
+    return Cell(text + more, strong=len(text))
 
 
 def result_table(result: Result) -> Table:

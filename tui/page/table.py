@@ -8,6 +8,11 @@ from typing import Literal, Self
 
 from estimator.records import dataclass
 
+WIDTH_OF_TABLES = 2000
+"""Columns that a table in a file or a pipe may need."""
+SHOWN_CONTROLS = {
+    code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"
+}
 Tone = Literal["plain", "good", "bad", "doubtful", "quiet"]
 
 
@@ -18,8 +23,9 @@ class Cell(str):
     ----------
     text : str
     tone : Tone
-    strong : bool
-        Whether it is emphasised, as the name of a row or a difference that is certain.
+    strong : bool or int
+        Whether it is emphasised, as the name of a row or a difference that is certain; of a number
+        other than 1, so many characters at its start.
     chosen : bool
         Whether it names what the rest of a screen shows.
     colour : str
@@ -28,7 +34,7 @@ class Cell(str):
 
     __slots__ = ("chosen", "colour", "strong", "tone")
     tone: Tone
-    strong: bool
+    strong: int
     chosen: bool
     colour: str
 
@@ -37,7 +43,7 @@ class Cell(str):
         text: object,
         tone: Tone = "plain",
         *,
-        strong: bool = False,
+        strong: int = False,
         chosen: bool = False,
         colour: str = "",
     ) -> Self:

@@ -93,7 +93,9 @@ def styled(cell: str) -> Text:
     """Return a cell in the colours of its meaning."""
     if not isinstance(cell, Cell):
         return Text(cell)
-    made = Text(cell, f"{'bold ' * cell.strong}{cell.colour or STYLES[cell.tone]}".strip())
+    made = Text(cell, f"{'bold ' * (cell.strong == 1)}{cell.colour or STYLES[cell.tone]}".strip())
+    if cell.strong > 1:
+        made.stylize("bold", 0, cell.strong)
     if cell.chosen:
         made.stylize("reverse", 2 * bool(cell.colour))
     return made

@@ -83,7 +83,7 @@ class Months:
             return {"answer": None}
         return {
             "answer": found,
-            "titles": (result_title(found.result).plain, course_title(found).plain),
+            "titles": (str(result_title(found.result)), course_title(found).plain),
             "tables": (result_table(found.result), course_table(found)),
             "averages": averages_line(found.pooled),
             "facts": [each.line for each in found.result.facts],
