@@ -39,6 +39,11 @@ def wishart(
     return np.asarray(factor @ factor.conj().swapaxes(-1, -2) / n_averages, np.complex128)
 
 
+def white(rng: np.random.Generator, *shape: int) -> ComplexArray:
+    """Complex white noise of variance 2."""
+    return np.asarray(rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+
+
 def rotation(rng: np.random.Generator, dims: int) -> FloatArray:
     """Rotation uniform over all of them, shape (dims, dims)."""
     q, r = np.linalg.qr(rng.standard_normal((dims, dims)))

@@ -15,6 +15,7 @@ from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.self_noise import coherency
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.types import ComplexArray, FloatArray
+from tests.estimator.csm_models import white
 from tests.traced_memory import peak_of
 
 N_FREQS, N_AVERAGES = 60, 200
@@ -23,13 +24,9 @@ N_FREQS, N_AVERAGES = 60, 200
 def _averages(n_sensors: int, *, apart: int = 0) -> ComplexArray:
     """Return averages of triaxial sensors; the last `apart` of them record another motion."""
     rng = np.random.default_rng(1)
-
-    def white(*shape: int) -> ComplexArray:
-        return np.asarray(rng.standard_normal((*shape, 2)) @ np.array([1, 1j]))
-
-    motion = 10 * white(2, N_FREQS, 3, N_AVERAGES)
+    motion = 10 * white(rng, 2, N_FREQS, 3, N_AVERAGES)
     parts = [motion[int(k >= n_sensors - apart)] for k in range(n_sensors)]
-    x = np.concatenate(parts, axis=1) + white(N_FREQS, 3 * n_sensors, N_AVERAGES)
+    x = np.concatenate(parts, axis=1) + white(rng, N_FREQS, 3 * n_sensors, N_AVERAGES)
     return np.asarray(x @ x.conj().swapaxes(1, 2) / N_AVERAGES)
 
 

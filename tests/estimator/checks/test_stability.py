@@ -33,7 +33,7 @@ from estimator.spectra.welch import (
 )
 from estimator.spectra.windows import get_window
 from estimator.types import ComplexArray
-from tests.estimator.csm_models import rotation
+from tests.estimator.csm_models import rotation, white
 
 LENGTH, HOP = 256, 128
 N_SEGMENTS = 300
@@ -233,19 +233,15 @@ def course_of(
 
     Its noise is `noise` times that of the others; the motion fades to `fade` of its amplitude.
     """
-
-    def white(*shape: int) -> ComplexArray:
-        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-
     n, n_kept = 360, 48
-    here, elsewhere = white(2, n, n_kept, 3)
+    here, elsewhere = white(rng, 2, n, n_kept, 3)
     level = np.sqrt(snr) * np.linspace(1.0, fade, n)[:, None, None]
     is_away = (np.arange(n) >= n * (1 - away))[:, None, None]
     sensors = []
     for number in range(3):
         motion = np.where(is_away, elsewhere, here) if number == 2 else here
         turned = motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
-        own = np.sqrt(noise if number == 2 else 1.0) * white(n, n_kept, 3)
+        own = np.sqrt(noise if number == 2 else 1.0) * white(rng, n, n_kept, 3)
         sensors.append(level * turned + own)
     return np.concatenate(sensors, axis=2)
 

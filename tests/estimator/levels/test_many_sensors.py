@@ -8,17 +8,14 @@ import pytest
 from estimator.levels import noise_matrices
 from estimator.levels.pooled import Pooled, pooled_noise
 from estimator.types import ComplexArray
+from tests.estimator.csm_models import white
 
 TRIAXIAL = np.repeat(np.arange(9), 3)
 
 
-def normal(rng: np.random.Generator, *shape: int) -> ComplexArray:
-    return np.asarray(rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
-
-
 def motion(rng: np.random.Generator, q: int, p: int = len(TRIAXIAL)) -> ComplexArray:
     """Return directions, those of the first matrix in one sensor alone."""
-    U = np.linalg.qr(normal(rng, 4, p, p))[0][:, :, :q]
+    U = np.linalg.qr(white(rng, 4, p, p))[0][:, :, :q]
     U[0] = np.eye(p)[:, :q]
     return U
 
@@ -35,7 +32,7 @@ def test_information_is_inverted_sensor_by_sensor(q: int) -> None:
     a, b = noise_matrices.pairs(TRIAXIAL)
     root = np.where(
         TRIAXIAL[:, None] == TRIAXIAL,
-        normal(np.random.default_rng(q), *U.shape[:2], len(TRIAXIAL)),
+        white(np.random.default_rng(q), *U.shape[:2], len(TRIAXIAL)),
         0,
     )
     rows = (root[:, :, a] * root[:, :, b].conj())[[1, 0, 0, 2]].swapaxes(0, 1)
@@ -58,7 +55,7 @@ def test_traces_of_many_are_those_of_whole_matrices(
     p, a = len(TRIAXIAL), noise_matrices.pairs(TRIAXIAL)[0]
     U = motion(rng, 3)
     Q = np.eye(p) - U @ U.conj().swapaxes(1, 2)
-    weight = rest * normal(rng, 4, p, len(a))
+    weight = rest * white(rng, 4, p, len(a))
     weight[:, np.arange(p)[:, None] // 3 == TRIAXIAL[a]] /= rest
     found = noise_matrices.traces(weight, Q, TRIAXIAL)
     monkeypatch.setattr(noise_matrices, "MANY", p + 1)
@@ -73,9 +70,9 @@ def test_noise_is_that_without_bounds_and_structure(
 ) -> None:
     rng = np.random.default_rng(5)
     p, n, n_bins = len(TRIAXIAL), 60, 12
-    felt = normal(rng, p, 3) * [3 * loudness, loudness, 0.4]
+    felt = white(rng, p, 3) * [3 * loudness, loudness, 0.4]
     felt[3:6, 1] *= 4  # a dimension that one sensor makes strong
-    drawn = normal(rng, n_bins, p, n) + felt @ normal(rng, n_bins, 3, n)
+    drawn = white(rng, n_bins, p, n) + felt @ white(rng, n_bins, 3, n)
     matrix = drawn @ drawn.conj().swapaxes(1, 2) / (2 * n)
 
     def noise() -> Pooled:

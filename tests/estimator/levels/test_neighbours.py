@@ -12,10 +12,7 @@ from estimator.levels.bands import BandLevels, band_levels
 from estimator.levels.pooled import LEAST_BINS, blocks_of
 from estimator.methods import self_noise
 from estimator.types import ComplexArray
-
-
-def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
-    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+from tests.estimator.csm_models import white
 
 
 def _turned(rng: np.random.Generator, n_sensors: int = 3) -> np.ndarray:
@@ -53,8 +50,8 @@ def test_neighbours_count_rightly_where_levels_fall_within_a_block(steep: str) -
     turned = _turned(rng)
     means, edges = [], np.array([40, 60, 75, 90, 110, 140, 180, 239])
     for _ in range(6):
-        motion = np.sqrt(level / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 3))
-        own = np.sqrt(noise / 2)[:, None, None] * _complex(rng, (n_freqs, int(n), 9))
+        motion = np.sqrt(level / 2)[:, None, None] * white(rng, n_freqs, int(n), 3)
+        own = np.sqrt(noise / 2)[:, None, None] * white(rng, n_freqs, int(n), 9)
         csm = _averaged(motion @ turned.T + own)
         held = _levels(csm, n, edges, blocks_of(frequency), "three-sensor")
         low, high = held.interval()
@@ -93,8 +90,8 @@ def test_motion_too_weak_for_one_third_of_an_octave_is_found_with_others(
     turned = _turned(rng)
     errors, spreads = [], []
     for _ in range(6):
-        motion = np.sqrt(ratio / 2) * _complex(rng, (n_freqs, int(n), 3))
-        own = np.sqrt(noise / 2)[:, None] * _complex(rng, (n_freqs, int(n), 9))
+        motion = np.sqrt(ratio / 2) * white(rng, n_freqs, int(n), 3)
+        own = np.sqrt(noise / 2)[:, None] * white(rng, n_freqs, int(n), 9)
         held = _levels(_averaged(motion @ turned.T + own), n, (10, 398), blocks_of(frequency))
         true = noise[10:398].mean(axis=0)
         errors.append(held.mean[0] / true - 1)
@@ -118,9 +115,9 @@ def test_motion_that_a_third_of_an_octave_resolves_is_not_looked_for_with_others
     )
     response = response * np.exp(varying[:9] + 1j * varying[9:]).T[:, :, None]
     noise = np.repeat([1.0, 1.0, 1e4], 3)
-    motion = np.sqrt(21 / 2) * _complex(rng, (n_freqs, n, 3))
+    motion = np.sqrt(21 / 2) * white(rng, n_freqs, n, 3)
     x = np.einsum("fpq,fnq->fnp", response, motion)
-    x += np.sqrt(noise / 2) * _complex(rng, (n_freqs, n, 9))
+    x += np.sqrt(noise / 2) * white(rng, n_freqs, n, 9)
     held = _levels(_averaged(x), n, (10, 398), blocks_of(frequency))
     low, high = held.interval()
     assert ((low[0] <= noise) & (noise <= high[0])).mean() > 0.7
@@ -144,7 +141,7 @@ def test_an_axis_that_is_dead_in_all_sensors_feels_no_dimension_of_the_motion() 
     """There were more dimensions than live channels of a sensor, and neighbours were not used."""
     rng = np.random.default_rng(55)
     n = 40
-    x = _complex(rng, (60, n, 12)) + 0.5 * np.tile(_complex(rng, (60, n, 3)), 4)
+    x = white(rng, 60, n, 12) + 0.5 * np.tile(white(rng, 60, n, 3), 4)
     csm = _averaged(x)
     live = np.arange(12) % 3 < 2
     csm[:, ~live] = csm[:, :, ~live] = 0

@@ -11,6 +11,7 @@ from estimator.levels.bands import bin_correlation
 from estimator.responses.calibration import CommonMotion, SensorCalibration
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
+from tests.estimator.csm_models import white
 
 FloatArray = NDArray[np.float64]
 
@@ -104,11 +105,8 @@ def scores(
     rng = np.random.default_rng(seed)
     p = d * len(snr)
     noise = np.repeat(1 / np.sqrt(snr), d)[:, None]
-    shape = (n_freqs, d, n)
-    motion = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-    shape = (n_freqs, p, n)
-    own = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-    samples = np.tile(motion, (1, len(snr), 1)) + noise * own
+    motion = white(rng, n_freqs, d, n)
+    samples = np.tile(motion, (1, len(snr), 1)) + noise * white(rng, n_freqs, p, n)
     csm = np.asarray(samples @ samples.conj().swapaxes(1, 2) / n, dtype=np.complex128)
     frequency = np.asarray(1.0 + 0.5 * np.arange(n_freqs), dtype=np.float64)
     common = CommonMotion(csm, frequency, (d,) * len(snr), 0, n, np.ones(1))

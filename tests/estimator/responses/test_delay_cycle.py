@@ -12,6 +12,7 @@ from estimator.checks.relative_response import cycle_is_ambiguous, relative_resp
 from estimator.checks.rules import orientation
 from estimator.responses.calibration import CommonMotion
 from estimator.types import ComplexArray, FloatArray
+from tests.estimator.csm_models import white
 
 NARROW = np.asarray(20.0 + 0.5 * np.arange(4), dtype=np.float64)
 WIDE = np.asarray(16.0 + 0.5 * np.arange(17), dtype=np.float64)
@@ -22,12 +23,7 @@ N = 30
 def drawn(seed: int, f: FloatArray, snr: float) -> ComplexArray:
     """Return the Wishart matrices of three equal sensors."""
     rng = np.random.default_rng(seed)
-
-    def gaussian(p: int) -> ComplexArray:
-        shape = (len(f), p, N)
-        return np.asarray(rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
-
-    samples = gaussian(1) + gaussian(3) / math.sqrt(snr)
+    samples = white(rng, len(f), 1, N) + white(rng, len(f), 3, N) / math.sqrt(snr)
     return np.asarray(samples @ samples.conj().swapaxes(1, 2) / N, dtype=np.complex128)
 
 
