@@ -9,10 +9,14 @@ import numpy as np
 from daq.estimation.noise_estimates import Channels, responses
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.snapshot import NonlinearChannel
-from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes, follows
+from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
+from estimator.levels.interval import unpredicted
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.multiresolution import Band
 from estimator.types import FloatArray
+
+_SHOWN = 2.0
+"""Power of a channel over what other sensors leave of it, below which none can be loud enough."""
 
 
 def nonlinear_channels(
@@ -36,12 +40,14 @@ def nonlinear_channels(
     """
     welch = passes[0].welch
     tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
-    if not len(tested.bins) or len(passes[0].aligned.dims) < 2:
+    dims = passes[0].aligned.dims
+    if not len(tested.bins) or len(dims) < 2:
         return ()
-    if [len(each.frequencies) for each in raw] == [len(welch.frequencies)] and not follows(
-        raw[0].csm[tested.bins]
-    ):
-        return ()
+    for band in raw if passes[0].octaves is None else ():
+        csm, averages = band.csm[tested.bins], np.full(len(tested.bins), band.n_effective)
+        left = unpredicted(csm, dims=dims, n_effective=averages)[0].sum(axis=0)
+        if (np.einsum("fii->i", csm).real < _SHOWN * left).all():
+            return ()
     total = sum(each.n_seen for each in passes)
     for each in passes:
         n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
@@ -49,7 +55,7 @@ def nonlinear_channels(
         last = max(each.n_seen - 1, 0) * welch.hop
         for samples in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
             tested.add(samples)
-    sensor = np.repeat(np.arange(len(passes[0].aligned.dims)), passes[0].aligned.dims)
+    sensor = np.repeat(np.arange(len(dims)), dims)
     response = np.abs(responses(frequency, channels, unit)) ** 2
     found = []
     for one in tested.nonlinear(sensor):

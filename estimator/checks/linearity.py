@@ -62,18 +62,6 @@ class Nonlinear:
     explained: FloatArray
 
 
-def follows(csm: ComplexArray) -> bool:
-    """Return whether any channel has more than twice the power that all others leave of it.
-
-    Else none is `LOUD`, unless squares and cubes are half of it. `csm` is (n_freqs, p, p).
-    """
-    power = np.einsum("fii->fi", csm).real
-    size = 1 / np.sqrt(np.where(power > 0, power, 1.0))
-    coherency = csm * size[:, :, None] * size[:, None] + 1e-12 * np.eye(csm.shape[1])
-    share = 1 / np.einsum("fii->fi", np.linalg.inv(coherency)).real
-    return not bool((power.sum(axis=0) <= 2 * (share * power).sum(axis=0)).all())
-
-
 class SquaresAndCubes:
     """Spectra of some segments with their squares and cubes.
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from daq.estimation.estimation import estimate
+from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
@@ -92,3 +93,10 @@ def test_a_compressed_gain_is_uncertain_by_what_it_lacks() -> None:
             if budget.quantity == "sensitivity" and each.source == "linearity"
         }
         assert by_sensor == dict.fromkeys(bent, pytest.approx(1 / 144, rel=0.2))
+
+
+def test_without_motion_no_segment_is_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(Pass, "whole_segments")
+    samples = np.random.default_rng(53).standard_normal((3, N_SAMPLES, 2))
+    recording = recording_of_arrays(dict(zip("ABC", samples, strict=True)), sampling_rate=RATE)
+    assert not estimate([recording], Settings(segment=5.0)).nonlinear

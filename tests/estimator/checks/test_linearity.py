@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.checks.linearity import MOST_SEGMENTS, Nonlinear, SquaresAndCubes, follows
+from estimator.checks.linearity import MOST_SEGMENTS, Nonlinear, SquaresAndCubes
 from estimator.spectra.welch import WelchSettings
 
 WELCH = WelchSettings(100.0, 500)
@@ -97,10 +97,3 @@ def test_false_alarms_are_rare(n: int, most: int) -> None:
         sensors = felt(rng, rng.uniform(0, 60), int(rng.integers(3, 6)), int(rng.choice([1, 3])))
         alarms += bool(found(sensors, white(rng, sensors)))
     assert alarms <= most
-
-
-def test_only_motion_makes_channels_follow_others() -> None:
-    own = np.tile(np.diag([1.0, 2.0, 0.0, 3.0]).astype(complex), (5, 1, 1))
-    assert not follows(own)  # nor does a dead one
-    assert follows(own + 2 * np.diag([0, 0, 0, 1]) + np.outer([1, 1, 0, 1], [1, 1, 0, 1]) * 10)
-    assert follows(np.full_like(own, np.nan))
