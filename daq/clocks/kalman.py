@@ -175,7 +175,7 @@ def _filter(
     p, grown = np.zeros((2, _GROWS + 2, len(walks)))
     p[_GROWS:] = grown[_GROWS:] = walks**2, np.ones_like(walks)
     p[:_GROWS:4] = _START[:, None] ** 2
-    square = (3, 3, len(walks))
+    covariance, after = (each[:_GROWS].reshape(3, 3, -1) for each in (p, grown))
     likelihood = np.zeros(len(walks))
     steps = np.diff(observations.seconds, prepend=observations.seconds[0])
     for first in range(0, len(steps), _AT_ONCE):
@@ -191,8 +191,7 @@ def _filter(
         for number, (lateness, variance, from_samples) in enumerate(each):
             x = transitions[number] @ x
             np.matmul(growths[number], p, out=grown[:_GROWS])
-            p, grown = grown, p
-            covariance = p[:_GROWS].reshape(square)
+            p, grown, covariance, after = grown, p, after, covariance
             if track is not None:
                 track.predicted[first + number] = x.T
                 track.predicted_covariance[first + number] = covariance.T
@@ -202,7 +201,7 @@ def _filter(
                 np.add(gain[0] + gain[2], variance, out=spread)
                 np.subtract(lateness - x[0], x[2], out=innovation)
             else:
-                gain = covariance[0].copy()
+                gain = covariance[0]
                 np.add(gain[0], arrival, out=spread)
                 np.subtract(lateness, x[0], out=innovation)
             np.maximum(spread, (innovation / _HUBER) ** 2, out=spread)
