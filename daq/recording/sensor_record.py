@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import itertools
 import os
 import threading
 from collections.abc import Iterator
@@ -123,8 +124,10 @@ class BlockTable:
             known_first, blocks = first, self._read(first, max(first, last))
             self._covering = first, first + len(blocks), blocks
         blocks = blocks[first - known_first : last - known_first]
-        ends = blocks["first_row"] + blocks["n_samples"]
-        return np.asarray(blocks[(ends > first_row) & (blocks["first_row"] < last_row)])
+        begins = blocks["first_row"]
+        ends = begins + blocks["n_samples"]
+        some = slice(np.searchsorted(ends, first_row, "right"), np.searchsorted(begins, last_row))
+        return np.asarray(blocks[some])
 
     def _check_contiguous(self, blocks: NDArray[np.void]) -> None:
         """Check that each block begins at the row where the previous one ends.
@@ -212,6 +215,8 @@ class LocatedChunks:
             dataset.id.chunk_iter(self._note)
         is_raw = (self._mask == RAW) & (self._size == self._n_bytes)
         self._raw_at = np.where(is_raw, self._at, -1)
+        self._apart = np.flatnonzero(np.diff(self._raw_at) != self._n_bytes) + 1
+        """Chunks that do not follow the one before in the file."""
 
     def _note(self, chunk: Any) -> None:  # noqa: ANN401 - h5py names no type
         at = chunk.chunk_offset[0] // self._length
@@ -251,14 +256,16 @@ class LocatedChunks:
         OSError
             If the file cannot be read.
         """
-        plain = rows.view(np.uint8).reshape(-1).data
-        at = self._raw_at[first : first + len(plain) // self._n_bytes]
+        plain, handle = rows.view(np.uint8).reshape(-1).data, self._file.get_vfd_handle()
+        last = first + len(plain) // self._n_bytes
+        at = self._raw_at[first:last]
         if len(at) * self._n_bytes < len(plain) or (at < 0).any():
             return False
-        cuts = np.flatnonzero(np.diff(at) != self._n_bytes) + 1
-        for begin, end in zip([0, *cuts.tolist()], [*cuts.tolist(), len(at)], strict=True):
+        low, high = np.searchsorted(self._apart, (first + 1, last)).tolist()
+        cuts = (self._apart[low:high] - first).tolist()
+        for begin, end in itertools.pairwise([0, *cuts, len(at)]):
             part = plain[begin * self._n_bytes : end * self._n_bytes]
-            if os.preadv(self._file.get_vfd_handle(), [part], int(at[begin])) < len(part):
+            if os.preadv(handle, [part], int(at[begin])) < len(part):
                 return False
         return True
 
