@@ -108,17 +108,28 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     found += _contradicted(snapshot, method, tuple(found))
-    if diagnostics.faulty:
+    if diagnostics.faulty or _disturbed(snapshot).any():
         found.append(_faulty(snapshot, psd))
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
 
 
+def _disturbed(snapshot: Snapshot) -> BoolArray:
+    """Return the channels of a sensor that was disturbed so much that it is taken for motion."""
+    found = snapshot.diagnostics.diagnosis
+    steady = None if found is None else found.stability
+    if steady is None or not math.isnan(steady.excess):
+        return np.zeros(len(snapshot.channels), np.bool_)
+    sensor = np.repeat(np.arange(len(snapshot.dims)), snapshot.dims)
+    return np.asarray(sensor == sensor[steady.channel])
+
+
 def _faulty(snapshot: Snapshot, psd: FloatArray) -> Contribution:
     """Return what faulty channels may be wrong by."""
     below, above = np.zeros((2, *psd.shape))
     below[:, sorted(snapshot.diagnostics.faulty)] = math.inf
+    below[:, _disturbed(snapshot)] = math.inf
     for column, seconds in snapshot.diagnostics.stood_still.items():
         lost = min(2 * seconds / snapshot.elapsed, 0.5)  # it reaches into the parts beside
         above[:, column] = psd[:, column] * lost / (1 - lost)

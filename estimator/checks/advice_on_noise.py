@@ -83,6 +83,7 @@ class DisturbedSegments(Advice):
         Start times of the first disturbed segments, s from the start.
     excess : float
         Noise added by these segments, as a fraction, at the frequencies with the largest fraction.
+        NaN where it is so much that the model does not tell it from motion.
     channel : int
         The channel with the largest excess.
     """
@@ -96,15 +97,15 @@ class DisturbedSegments(Advice):
     def _words(self, names: Names) -> Words:
         more = self.n_disturbed - len(self.times)
         times = ", ".join(f"{time:.0f} s" for time in self.times)
+        much = f"up to {percent(self.excess)} " if math.isfinite(self.excess) else ""
         return Words(
             f"{several(self.n_disturbed, 'disturbed segment')}, most in "
-            f"{names.channels[self.channel]}: "
-            f"noise up to {percent(self.excess)} too high; use --reject",
+            f"{names.channels[self.channel]}: noise {much}too high; use --reject",
             f"{self.n_disturbed} of {self.n_segments} segments "
             f"{'differ' if self.n_disturbed > 1 else 'differs'} from all others in what is "
             f"no common motion, most in {names.channels[self.channel]} (from the start: {times}"
-            f"{f' and {more} more' if more else ''}). They add up to {percent(self.excess)} to the "
-            "noise.",
+            f"{f' and {more} more' if more else ''})."
+            + (f" They add {much}to the noise." if much else ""),
             "Exclude disturbed segments (--reject).",
         )
 

@@ -108,9 +108,10 @@ def changes(
         )
     n_disturbed = len(stability.disturbed)
     if n_disturbed and times is not None:
-        rank = Rank.DELAYS if stability.excess >= SMALL else Rank.TO_KNOW
+        excess = float(np.nan_to_num(stability.excess, nan=np.inf))
+        rank = Rank.DELAYS if excess >= SMALL else Rank.TO_KNOW
         yield DisturbedSegments(
-            rank=Rank.INVALIDATES if stability.excess >= LARGE else rank,
+            rank=Rank.INVALIDATES if excess >= LARGE else rank,
             sensors=(int(sensor_of[stability.channel]),),
             n_disturbed=n_disturbed,
             n_segments=stability.n_segments,

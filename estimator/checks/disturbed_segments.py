@@ -129,7 +129,7 @@ def segment_findings(
     found = replace(none, gains=variance, sure=sure)
     groups = groups[:n_good]
     if not groups:
-        return found
+        return _louder_than_others(found, course, there, dims)
     step = float(np.median(np.diff(course.times)))
     mixing = np.stack([(np.abs(residuals.projector[group]) ** 2).sum(axis=0) for group in groups])
     found = replace(
@@ -143,7 +143,35 @@ def segment_findings(
     inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
     lack = [1 / np.maximum(1 + excess[group].mean(axis=0), 0.01) - 1 for group in groups]
-    return replace(found, disturbed=out, excess=np.stack(lack)[calm])
+    found = replace(found, disturbed=out, excess=np.stack(lack)[calm])
+    return _louder_than_others(found, course, there, dims)
+
+
+def _louder_than_others(
+    found: SegmentFindings, course: SegmentCourse, columns: IntArray, dims: tuple[int, ...]
+) -> SegmentFindings:
+    """Return findings with segments in which one sensor is louder than all others.
+
+    What disturbs it much is taken for motion, and the noise of all sensors is in doubt. But motion
+    is felt by all: none is louder than the loudest of the others by more than its noise or gain.
+    """
+    first, d = np.cumsum([0, *dims])[:-1], np.array(dims)
+    power = np.stack(
+        [
+            np.add.reduceat((np.abs(course.spectra[:, some]) ** 2).mean(axis=1), first, axis=1) / d
+            for some in np.array_split(columns, max(1, len(columns) // FREQUENCIES))
+        ],
+        axis=1,
+    )
+    others = np.stack([np.delete(power, i, axis=2).max(axis=2) for i in range(len(d))], axis=2)
+    ratio = np.maximum(median(power / others), 1.0)
+    most = 1 + DISTURBED * np.sqrt(2 / (FREQUENCIES * d))
+    louder = (power > most * ratio * others) & (power > most * median(power))
+    out = louder.any(axis=(1, 2))
+    if not out.any() or out.mean() > MAX_DISTURBED:
+        return found
+    excess = np.where(np.repeat(louder.any(axis=(0, 1)), d), np.nan, 0.0)[None]
+    return replace(found, disturbed=found.disturbed | out, excess=excess)
 
 
 class _Gains:

@@ -417,7 +417,9 @@ def stability(
         if kept.sum() >= MIN_PARTS:
             bands = [None if band is None else band.of_parts(kept) for band in bands]
             levels = [None if band is None else band.levels for band in bands]
-    elif not (changes or suspect or loudness.size.any()) and all(e is None for e in levels):
+    elif not (changes or suspect or loudness.size.any() or single.disturbed.any()) and all(
+        each is None for each in levels
+    ):
         return None
     within = np.full_like(explained, np.nan) if without is None else without.within
     within[:, left.any(axis=0)] = np.nan  # parts do not show it

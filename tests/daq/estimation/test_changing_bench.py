@@ -16,7 +16,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
 from daq.results.result import Result
-from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges
+from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from tests.acceptance.broken_assumptions import one
 
 RATE = 20.0
@@ -104,6 +104,32 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     assert np.abs(10 * np.log10(found.mean / NOISE)).max() < most
     assert held(snapshot) > 0.93
     assert snapshot.n_effective < 420  # of 455: every part has spent three
+
+
+def test_a_tap_as_loud_as_the_motion_names_the_sensor_and_opens_its_interval() -> None:
+    """It is taken for motion: the model failed, and "move them closer" was all that was said."""
+    samples = recorded("steady", 3)
+    begin = int(0.6 * N)
+    samples["B"][begin : begin + 20] += 300 * np.random.default_rng(9).standard_normal((20, 3))
+    snapshot = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    (found,) = [e for e in snapshot.diagnostics.advice if isinstance(e, DisturbedSegments)]
+    assert snapshot.channels[found.channel].sensor == "B"
+    assert begin / RATE - 5 < found.times[0] < begin / RATE + 1
+    assert not np.isfinite(found.excess)
+    assert "noise too high; use --reject" in found.words(snapshot.names).line
+    result = Result(snapshot, Settings())
+    for mean in result.means(result.method, (1.0, 9.0))[3:6]:
+        assert mean.low[0] <= NOISE <= mean.high[0]
+
+
+def test_a_burst_of_the_motion_disturbs_no_quiet_sensor() -> None:
+    rng = np.random.default_rng(4)
+    motion = rng.standard_normal(N)
+    motion[N // 2 : N // 2 + 400] *= 100
+    noise = {"A": 30.0, "B": 1.0, "C": 30.0}
+    samples = {name: motion + e * rng.standard_normal(N) for name, e in noise.items()}
+    snapshot = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    assert not any(isinstance(e, DisturbedSegments) for e in snapshot.diagnostics.advice)
 
 
 @pytest.mark.parametrize("octaves", [False, True])
