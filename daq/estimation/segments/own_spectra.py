@@ -15,19 +15,13 @@ from estimator.spectra.welch import WelchSettings, trends
 FloatArray = NDArray[np.float64]
 
 
-def need_samples_of_grid(settings: Settings, *, filtered: bool, exact: bool) -> str:
-    """Return why segments need samples on the grid; empty if each sensor's own ones will do."""
-    if exact:
-        return "the samples are on the grid"
-    if settings.window != "hann":
-        return "only a Hann window can be shifted by a fraction of a sample"
-    if filtered:
-        return "filters work on samples"
-    if settings.octaves:
-        return "octaves are decimated on the grid"
-    if settings.reject:
-        return "transients are looked for in the samples of the grid"
-    return ""
+def need_samples_of_grid(settings: Settings) -> bool:
+    """Return whether segments need samples on the grid, whatever the clocks.
+
+    Octaves and the search for transients do, and windows that cannot be shifted by a fraction of a
+    sample.
+    """
+    return settings.window != "hann" or settings.octaves or bool(settings.reject)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

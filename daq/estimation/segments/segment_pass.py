@@ -391,7 +391,7 @@ class Pass:
 
         source = self._newest if live and len(pieces) == 1 else self.aligned
 
-        on_grid = self._why_on_grid()
+        on_grid = self._is_on_grid
 
         def read(piece: _Span, room: _Sums | None = None) -> _Samples | OwnSpectra:
             first, count = piece
@@ -427,7 +427,7 @@ class Pass:
         """Return whether forks can work out the sums of most of these pieces, and are worth it."""
         every = 0 if self._ends is None else self._ends.every
         is_sum = self.octaves is None and self._undisturbed is None and self._all.products_shape
-        by_spectra = not self._delays.measures or not (self._why_on_grid() or self._every == 1)
+        by_spectra = not self._delays.measures or not (self._is_on_grid or self._every == 1)
         return bool(
             self._jobs > 1
             and forked.IS_POSSIBLE
@@ -607,7 +607,7 @@ class Pass:
         other. If they differ, delays are measured in every segment after all.
         """
         wanted = self._delays.fewest and not self.n_seen and self.aligned.is_unbroken
-        if not wanted or self._why_on_grid():
+        if not wanted or self._is_on_grid:
             return
         for every in sorted({min(most, self.n_complete // _SURVEYED) for most in _SURVEYS})[::-1]:
             if every < 2:
@@ -672,10 +672,11 @@ class Pass:
         own = self.aligned.own_samples(begins, self.welch.segment_length)
         return None if own is None else OwnSpectra.of(own, self.welch)
 
-    def _why_on_grid(self) -> str:
-        """Return why segments are taken from samples on the grid; empty if they are not."""
-        filtered, exact = self.filters is not None, self.aligned.is_exact
-        return need_samples_of_grid(self._settings, filtered=filtered, exact=exact)
+    @property
+    def _is_on_grid(self) -> bool:
+        """Whether segments are taken from samples on the grid: filters need these, too."""
+        is_filtered = self.filters is not None
+        return is_filtered or self.aligned.is_exact or need_samples_of_grid(self._settings)
 
     def _take(self, samples: FloatArray, starts: NDArray[np.int64], first: int) -> None:
         """Add the segments that begin at rows `starts` of `samples`.

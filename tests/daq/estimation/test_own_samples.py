@@ -128,9 +128,7 @@ def test_the_noise_is_that_from_the_interpolated_grid(
     path = write(tmp_path / "free.h5", free(gaps=gaps))
     settings = replace(SETTINGS, overlap=overlap)
     own = estimate([path], settings)
-    monkeypatch.setattr(
-        "daq.estimation.segments.segment_pass.need_samples_of_grid", lambda *_, **__: "a test"
-    )
+    monkeypatch.setattr("daq.estimation.segments.segment_pass.need_samples_of_grid", lambda _: True)
     grid = estimate([path], settings)
     assert own.n_segments == grid.n_segments
     band = (own.frequency > 1) & (own.frequency < 44)
@@ -179,9 +177,7 @@ def test_delays_are_measured_in_few_segments_only_of_clocks_that_are_straight(
     "changed",
     [{"window": "blackman"}, {"reject": True}, {"octaves": True}, {"window": "rectangular"}],
 )
-def test_what_needs_samples_of_the_grid_says_why(changed: dict[str, object]) -> None:
-    assert not need_samples_of_grid(SETTINGS, filtered=False, exact=False)
-    assert need_samples_of_grid(SETTINGS, filtered=True, exact=False)
-    assert need_samples_of_grid(SETTINGS, filtered=False, exact=True)
+def test_some_settings_need_samples_of_the_grid(changed: dict[str, object]) -> None:
+    assert not need_samples_of_grid(SETTINGS)
     wanted = replace(SETTINGS, **changed)  # type: ignore[arg-type]  # of several types
-    assert need_samples_of_grid(wanted, filtered=False, exact=False)
+    assert need_samples_of_grid(wanted)
