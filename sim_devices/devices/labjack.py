@@ -257,7 +257,7 @@ class LabJack:
         for address, value in _WORDS.items():
             self._store(address, struct.pack(">I", value))
         self._store(reg.LAST_ERROR_DETAIL, bytes(2))
-        self._rate_now = reg.actual_t8_scan_rate if self._is_t8 else reg.actual_scan_rate
+        self._rate_now = reg.exact_rate if self._is_t8 else reg.actual_scan_rate
         if self._is_t8:
             self._store(reg.STREAM_SCANRATE_HZ_ACTUAL, bytes(4))
         for k in range(128):
@@ -456,11 +456,9 @@ class LabJack:
 
 def _t8_calibrations() -> list[reg.RangeCalibration]:
     """Return the calibrations of a T8 with a small error in each input."""
-    nominal = reg.nominal_t8_calibrations()
-    per_input = len(reg.T8_RANGES)
     return [
-        replace(one, positive_slope=one.positive_slope * (1 + 1e-4 * (k // per_input)))
-        for k, one in enumerate(nominal)
+        one._replace(positive_slope=one.positive_slope * (1 + 1e-4 * (k // len(reg.T8_RANGES))))
+        for k, one in enumerate(reg.nominal_t8_calibrations())
     ]
 
 
@@ -522,18 +520,8 @@ class StreamPort(Endpoint):
         stream.advance(now)
         size, sent = self._labjack.packet_size, []
         while stream.n_waiting >= size or stream.is_due or stream.ended:
-            packet = stream.take_out(size)
-            sent.append(
-                encode_packet(
-                    Packet(
-                        packet.samples,
-                        packet.backlog,
-                        packet.status,
-                        packet.information,
-                        self._transaction,
-                    )
-                )
-            )
+            packet = replace(stream.take_out(size), transaction=self._transaction)
+            sent.append(encode_packet(packet))
             self._transaction = (self._transaction + 1) % 65536
             if stream.ended and not stream.n_waiting:
                 self._labjack.stop()

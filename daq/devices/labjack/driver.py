@@ -212,11 +212,6 @@ def real(address: int, value: float) -> WriteAt:
     return WriteAt(address, struct.pack(">f", value))
 
 
-def exact(rate: float) -> float:
-    """Return the exact rate: its interval is a whole number of timer ticks, but FLOAT32 rounds."""
-    return reg.CORE_HZ / max(1, round(reg.CORE_HZ / rate))
-
-
 def inputs_of(
     sensors: Sequence[Sensor], settings: dict[str, LabJackSettings]
 ) -> dict[str, tuple[int, ...]]:
@@ -403,7 +398,7 @@ async def set_stream(
             "setting the scan list", WriteAt(reg.STREAM_SCANLIST + 2 * start, values)
         )
     if product == "T7":
-        return exact(await registers.real(reg.STREAM_SCANRATE_HZ))
+        return reg.exact_rate(await registers.real(reg.STREAM_SCANRATE_HZ))
     # A T8 reports its rate only while it streams; these samples are discarded.
     await registers.do("starting the stream", long(reg.STREAM_ENABLE, 1))
     try:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,12 +92,13 @@ def actual_scan_rate(wanted: float) -> float:
     return 1e7 / max(1, round(1e7 / wanted)) if wanted > 152.588 else _slow_rate(wanted)
 
 
-def actual_t8_scan_rate(wanted: float) -> float:
-    """Return the scan rate of a simulated T8 that is set to ``wanted``, in Hz: 40 MHz divided.
+def exact_rate(rate: float) -> float:
+    """Return the nearest rate whose interval is a whole number of timer ticks, in Hz.
 
-    The clock divider of a real T8 is not published; the driver reads the actual rate.
+    FLOAT32 rounds the rate of a T7. The clock divider of a real T8 is not published: a simulated
+    T8 has this rate, and the driver reads the actual one.
     """
-    return CORE_HZ / max(1, round(CORE_HZ / wanted))
+    return CORE_HZ / max(1, round(CORE_HZ / rate))
 
 
 def _slow_rate(wanted: float) -> float:
@@ -238,8 +239,7 @@ def feedback_values(pdu: bytes, expected_bytes: int) -> bytes:
 # --- calibration -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class RangeCalibration:
+class RangeCalibration(NamedTuple):
     """Conversion from counts of one range to volts."""
 
     positive_slope: float = 3.158058e-4
@@ -284,11 +284,8 @@ def nominal_t8_calibrations() -> tuple[RangeCalibration, ...]:
 
 def encode_t8_calibrations(calibrations: Sequence[RangeCalibration]) -> bytes:
     """Encode the flash of a T8, from its header to the last input."""
-    sets = [
-        struct.pack(f">{_SET}f", one.positive_slope, one.negative_slope, one.center, one.offset)
-        for one in calibrations
-    ]
-    return bytes(T8_CALIBRATION_HEADER) + b"".join(sets)
+    sets = b"".join(struct.pack(f">{_SET}f", *one) for one in calibrations)
+    return bytes(T8_CALIBRATION_HEADER) + sets
 
 
 def decode_calibration(flash: bytes) -> RangeCalibration:
@@ -309,11 +306,7 @@ def nominal_calibrations() -> tuple[RangeCalibration, ...]:
 
 def encode_calibrations(calibrations: Sequence[RangeCalibration]) -> bytes:
     """Encode the flash of a T7: eight calibrations, then nominal values for the rest."""
-    values = [
-        value
-        for one in calibrations
-        for value in (one.positive_slope, one.negative_slope, one.center, one.offset)
-    ]
+    values = [value for one in calibrations for value in one]
     values += [13200.0, 0.0, 13200.0, 0.0, -92.6, 467.6, 1e-5, 2e-4, 1.5e-8]
     return struct.pack(f">{N_CALIBRATION_VALUES}f", *values)
 
