@@ -122,9 +122,6 @@ class _Link(Protocol):
     ) -> _Answer:
         """Return the reply; ``late``: see :class:`ReplyFinder`."""
 
-    async def settle(self, seconds: float) -> None:
-        """Wait for a late reply and discard it."""
-
 
 class _RtuLink:
     """Modbus RTU over a serial line or a serial server."""
@@ -173,9 +170,6 @@ class _RtuLink:
             raise DamagedReplyError(unexpected)
         raise NoAnswerError(unexpected)
 
-    async def settle(self, seconds: float) -> None:
-        await asyncio.sleep(seconds)
-
 
 class _TcpLink:
     """Modbus TCP."""
@@ -220,9 +214,6 @@ class _TcpLink:
         if request.function == rtu.READ_HOLDING:
             return await client.read_holding_registers(address, count=request.value, device_id=unit)
         return await client.read_input_registers(address, count=request.value, device_id=unit)
-
-    async def settle(self, seconds: float) -> None:
-        """Do nothing: replies are numbered."""
 
     def _trace(self, sending: bool, packet: bytes) -> bytes:
         if not sending:
@@ -386,8 +377,9 @@ class ModbusBus:
         return answer
 
     async def settle(self, seconds: float | None = None) -> None:
-        """Wait for a late reply, by default for the last timeout, and discard it."""
-        await self._link.settle(self._patience if seconds is None else seconds)
+        """Wait for a late reply, by default for the last timeout; the next request discards it."""
+        if not self._link.numbers_requests:
+            await asyncio.sleep(self._patience if seconds is None else seconds)
 
 
 @contextlib.asynccontextmanager
