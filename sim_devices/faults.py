@@ -83,7 +83,7 @@ from pydantic import (
 from sim_devices.errors import ScenarioError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
     from pydantic_core import ErrorDetails
@@ -137,25 +137,26 @@ class Fault(BaseModel):
 
         Random delays (``spread``) differ from device to device, by their ``name``.
         """
-        every, repetitions = (
-            self.every or 0.0,
-            range(1) if self.every is None else itertools.count(),
-        )
+        repetitions: Iterable[int] = range(1)
         if self.every is not None:
-            first = max(0, math.ceil((begin - self.spread - self.at) / every))
+            first = max(0, math.ceil((begin - self.spread - self.at) / self.every))
             repetitions = itertools.count(first)
         for k in repetitions:
-            late = 0.0
+            at = self.at + k * (self.every or 0.0)
             if self.spread:
                 rng = np.random.default_rng([self.seed, k, zlib.crc32(name.encode())])
-                late = float(rng.uniform(0, self.spread))
-            if self.at + k * every + late >= begin:
-                yield self.at + k * every + late
+                at += float(rng.uniform(0, self.spread))
+            if at >= begin:
+                yield at
 
     def is_on(self, times: FloatArray) -> NDArray[np.bool_]:
         """Return whether a lasting fault is on at world ``times`` (n,)."""
         since = times - self.at
         return (since >= 0) & (np.mod(since, self.every or math.inf) < self.duration)
+
+    def is_of(self, sensor: str) -> bool:
+        """Return whether the fault affects a sensor."""
+        return self.sensors is None or sensor in self.sensors
 
 
 _SCRIPT = TypeAdapter(list[Fault])
@@ -239,13 +240,12 @@ class SampleFaults:
 
         Negative numbers are samples that are counted again.
         """
-        mine = [one for one in self._slips if one.sensors is None or sensor in one.sensors]
-        return heapq.merge(*(_slips_of(one, sensor) for one in mine))
+        return heapq.merge(*(_slips_of(one, sensor) for one in self._slips if one.is_of(sensor)))
 
     def stated_ns(self, sensor: str, utc_ns: int) -> int:
         """Return the UTC in ns that a device states."""
         for fault in self._coarse:
-            if fault.sensors is None or sensor in fault.sensors:
+            if fault.is_of(sensor):
                 step = round(fault.level * 1e9)
                 utc_ns = utc_ns // step * step
         return utc_ns
@@ -254,25 +254,21 @@ class SampleFaults:
         """Return where a sensor is on another floor at world ``times`` (n,)."""
         moved = np.zeros(times.shape, dtype=bool)
         for fault in self._moves:
-            if fault.sensors is None or sensor in fault.sensors:
+            if fault.is_of(sensor):
                 moved |= fault.is_on(times)
         return moved
 
     def is_silent(self, sensor: str, now: float) -> bool:
         """Return whether the device of a sensor is off at world time ``now``."""
-        return any(
-            (fault.sensors is None or sensor in fault.sensors)
-            and now >= fault.at
-            and math.fmod(now - fault.at, fault.every or math.inf) < fault.duration
-            for fault in self._silences
-        )
+        at = np.array([now])
+        return any(fault.is_of(sensor) and bool(fault.is_on(at)) for fault in self._silences)
 
     def apply(
         self, sensor: str, counts: NDArray[np.float64], times: FloatArray
     ) -> NDArray[np.float64]:
         """Return counts (n, n_channels), sampled at world ``times`` (n,), with the faults."""
         for fault in self._faults:
-            if fault.sensors is not None and sensor not in fault.sensors:
+            if not fault.is_of(sensor):
                 continue
             columns = slice(None)
             if fault.channel is not None:
@@ -374,21 +370,19 @@ class LineFaults:
             elif self._armed and unit:
                 struck = self._strike(self._armed.popleft()[1], unit, now)
             sent += struck
-        if now < self._paused_until:
-            for unit in sent if now < self._full_at else ():
-                self._hold(unit, self._paused_until)
+        if self._full_at <= now < self._paused_until:
             sent = []
-        elif self._delay is not None and now < self._delayed_until:
-            for unit in sent:
-                self._hold(unit, self._delayed(self._delay, now))
-            sent = []
-        elif self._held:
-            for unit in sent:
-                self._hold(unit, now)
-            sent = []
-        return [*self._released(now), *sent]
+        for unit in sent:
+            self._hold(unit, self._leaves(now))
+        return self._released(now)
 
-    def _delayed(self, fault: Fault, now: float) -> float:
+    def _leaves(self, now: float) -> float:
+        """Return when a unit of now is sent, at the earliest."""
+        fault = self._delay
+        if now < self._paused_until:
+            return self._paused_until
+        if fault is None or now >= self._delayed_until:
+            return now
         if fault.kind == "jitter":
             return now + self._rng.uniform(0, fault.level)
         if fault.kind == "latency":
