@@ -60,16 +60,14 @@ class WhiteSources:
     ) -> None:
         self.n_sources = n_sources
         self.block = min(longest_block, 2 ** ((LARGEST_SPECTRUM // n_sources).bit_length() - 1))
-        self._key = np.array(key, dtype=np.uint64)
+        self._key = key
         self._samples: dict[int, FloatArray] = {}
         self._spectra: dict[int, ComplexArray] = {}
 
     def samples(self, index: int) -> FloatArray:
         """Return block `index` (any integer), shape (n_sources, block)."""
         if index not in self._samples:
-            counter = np.array([0, 0, index % 2**64, 0], dtype=np.uint64)
-            random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
-            _keep(self._samples, index, random.standard_normal((self.n_sources, self.block)))
+            _keep(self._samples, index, _normal(self._key, index, self.n_sources, self.block))
         return self._samples[index]
 
     def spectrum(self, index: int) -> ComplexArray:
@@ -78,6 +76,13 @@ class WhiteSources:
             both = np.concatenate([self.samples(index - 1), self.samples(index)], axis=1)
             _keep(self._spectra, index, fft.rfft(both))
         return self._spectra[index]
+
+
+def _normal(key: tuple[int, int], index: int, *shape: int) -> FloatArray:
+    """Return block `index` (any integer) of a white series, equal in every process."""
+    counter = np.array([0, 0, index % 2**64, 0], dtype=np.uint64)
+    philox = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
+    return np.random.Generator(philox).standard_normal(shape)
 
 
 class GaussianSeries:
@@ -173,7 +178,7 @@ class SampleClock:
     def __init__(self, clock: SensorClock, *, sampling_rate: float, key: tuple[int, int]) -> None:
         self._clock = clock
         self._sampling_rate = sampling_rate
-        self._key = np.array(key, dtype=np.uint64)
+        self._key = key
         self._rate = np.zeros(1)  # random walk of the rate at each knot, s/s
         self._time = np.zeros(1)  # its integral, s
 
@@ -210,10 +215,9 @@ class SampleClock:
         return np.asarray(self._time[knot] + KNOT_SPACING * within)
 
     def _extend(self) -> None:
-        counter = np.array([0, 0, len(self._rate) // KNOTS_PER_BLOCK, 0], dtype=np.uint64)
-        random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
+        white = _normal(self._key, len(self._rate) // KNOTS_PER_BLOCK, KNOTS_PER_BLOCK)
         step = self._clock.wander * 1e-6 * np.sqrt(KNOT_SPACING / 3600)
-        rate = self._rate[-1] + np.cumsum(step * random.standard_normal(KNOTS_PER_BLOCK))
+        rate = self._rate[-1] + np.cumsum(step * white)
         before = np.concatenate([self._rate[-1:], rate[:-1]])
         time = self._time[-1] + np.cumsum(KNOT_SPACING * (before + rate) / 2)
         self._rate = np.concatenate([self._rate, rate])
@@ -225,7 +229,7 @@ class MotionLevel:
 
     def __init__(self, level: ChangingLevel, *, key: tuple[int, int]) -> None:
         self._level = level
-        self._key = np.array(key, dtype=np.uint64)
+        self._key = key
 
     def amplitude(self, times: FloatArray) -> FloatArray:
         """Return the factor of the motion at world `times` in s, shape (n,)."""
@@ -238,14 +242,9 @@ class MotionLevel:
     def _knots(self, first: int, end: int) -> FloatArray:
         """Return the level in dB at knots `first` to `end`, excluded."""
         blocks = range(first // KNOTS_PER_BLOCK, (end - 1) // KNOTS_PER_BLOCK + 1)
-        each = []
-        for block in blocks:
-            counter = np.array([0, 0, block % 2**64, 0], dtype=np.uint64)
-            random = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
-            each.append(random.standard_normal(KNOTS_PER_BLOCK))
+        each = [_normal(self._key, block, KNOTS_PER_BLOCK) for block in blocks]
         begin = first - blocks[0] * KNOTS_PER_BLOCK
-        whole = np.concatenate(each)[begin : begin + end - first]
-        return np.asarray(self._level.deviation * whole)
+        return self._level.deviation * np.concatenate(each)[begin : begin + end - first]
 
 
 GRID_OVERSAMPLING = 4  # rate of the master grid over the highest frequency of the motion
