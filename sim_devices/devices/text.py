@@ -9,10 +9,9 @@ Shake. With the settings ``start`` and ``stop``, the device sends only between t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 from daq.devices.text.format import (
-    PRESETS,
     SINCE_START,
     TextFormat,
     encode_fields,
@@ -28,31 +27,18 @@ SUPPLY = 11.96
 _NS = 1_000_000_000
 
 
-def format_of(device: DeviceSpec) -> TextFormat:
-    """Return the format of the device's settings."""
-    settings = device.settings
-    given = {
-        f.name: settings[f.name] for f in fields(TextFormat) if settings.get(f.name) is not None
-    }
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-    format_ = replace(PRESETS[settings.get("preset", "none")], **given)
-    (sensor,) = device.sensors
-    names = tuple(c.name for c in device.channels[sensor] if not c.auxiliary)
-    if format_.layout != "row":
-        return replace(format_, channel_names=tuple(settings.get("channel_names") or names))
-    return format_ if format_.columns else replace(format_, columns=tuple(range(len(names))))
-
-
 class TextDevice(Endpoint):
     """One device; an :class:`~sim_devices.devices.interface.Endpoint`."""
 
     def __init__(self, device: DeviceSpec, source: Source) -> None:
-        self._format = format_of(device)
+        (sensor,) = device.sensors
+        names = [channel.name for channel in device.channels[sensor] if not channel.auxiliary]
+        self._format = TextFormat.of(device.settings, names)
         self._utc_ns = device.utc_ns
         self._start = str(device.settings.get("start", "")).encode()
         self._stop = str(device.settings.get("stop", "")).encode()
         self._tail = LILY_TAIL if device.settings.get("preset") == "lily" else ()
-        self._source, self._sensor = source, device.sensors[0]
+        self._source, self._sensor = source, sensor
         self._samples = Samples(source, device.sensors)
         self._received = b""
         self._sends = False

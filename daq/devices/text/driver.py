@@ -11,26 +11,21 @@ end. LILY tiltmeters need ``*9900XYC2`` and ``*9900XYC-OFF``.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from pydantic import Field, PositiveFloat, PositiveInt, Strict, field_validator
 
 from daq.devices import interface
 from daq.devices.port_rules import only, port_label
 from daq.devices.text.decoder import TextDecoder
-from daq.devices.text.format import (
-    PRESETS,
-    SINCE_START,
-    TextFormat,
-    is_readable,
-)
+from daq.devices.text.format import SINCE_START, TextFormat, is_readable
 from daq.devices.text.guess import guess_settings
 from daq.errors import DeviceError, toml_value
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from daq.transport.ports import open_port
-from daq.transport.udp import DatagramStream, open_datagrams
+from daq.transport.udp import open_datagrams
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -39,7 +34,9 @@ if TYPE_CHECKING:
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
+    from daq.protocols.block import HostTime
     from daq.transport.byte_stream import ByteStream
+    from daq.transport.udp import DatagramStream
 
 
 class TextSettings(interface.DriverSettings, strict=True):
@@ -126,18 +123,8 @@ class TextSettings(interface.DriverSettings, strict=True):
             If the number of columns or names differs from the number of channels, or the settings
             contradict each other.
         """
-        given = {
-            field.name: value
-            for field in fields(TextFormat)
-            if (value := getattr(self, field.name)) is not None
-        }
-        format_ = replace(PRESETS[self.preset], **given)
         n_channels = len(sensor.channels)
-        if format_.layout != "row":
-            names = self.channel_names or tuple(channel.name for channel in sensor.channels)
-            format_ = replace(format_, channel_names=names)
-        elif not format_.columns:
-            format_ = replace(format_, columns=tuple(range(n_channels)))
+        format_ = TextFormat.of(self.model_dump(), [channel.name for channel in sensor.channels])
         places = format_.channel_keys
         if len(places) != n_channels:
             what = "columns" if format_.layout == "row" else "channel_names"
@@ -172,67 +159,31 @@ def _check_format(format_: TextFormat, sensor: Sensor) -> None:
             raise sensor.fault(f"settings.{key}", expected, value)
 
 
-class _Source:
-    """Source of the text: a stream of bytes."""
-
-    def __init__(self, stream: ByteStream | DatagramStream, decoder: TextDecoder) -> None:
-        self._stream = stream
-        self._decoder = decoder
-
-    async def receive(self) -> list[DeviceItem]:
-        received, at = await self._stream.read()
-        return self._decoder.receive(received, at)
-
-    async def send(self, payload: bytes) -> None:
-        await self._stream.write(payload)
-
-    def discard(self) -> None:
-        self._stream.discard()
-
-
-class _DatagramSource(_Source):
-    _stream: DatagramStream
-
-    def __init__(self, stream: DatagramStream, decoder: TextDecoder, sensor: str) -> None:
-        super().__init__(stream, decoder)
-        self._sensor = sensor
-        self._told: set[str] = set()
-
-    async def receive(self) -> list[DeviceItem]:
-        received, at = await self._stream.read()
-        found = self._decoder.receive_datagram(received, at)
-        if any(isinstance(item, Block) for item in found):
-            self._stream.bind()
-        for host in sorted(self._stream.strangers - self._told):
-            self._told.add(host)
-            text = f"datagrams from {host} are ignored: another device sends to this port"
-            found.append(Event(self._sensor, EventKind.STATUS, text, at))
-        return found
-
-
 @dataclass(eq=False)
 class TextSession(interface.Session):
     """An open port; the device sends by itself or after the start command."""
 
-    source: _Source
+    stream: ByteStream | DatagramStream
+    sensor: Sensor
     settings: TextSettings
     information: tuple[interface.DeviceInformation, ...]
     decoder: TextDecoder
 
     def __post_init__(self) -> None:
         self.patience = self.settings.patience
-        self._advice = (
-            "check that the device sends to this computer and port, and that no firewall blocks it"
-            if isinstance(self.source, _DatagramSource)
-            else "check cable, power, settings.baud_rate and settings.start"
-        )
+        self._told: set[str] = set()
 
     @property
     def hint(self) -> str:
         """Advice if no block arrives: on the format, if rows arrive but none is readable."""
         rows = self.decoder.first_rows
         if not rows:
-            return self._advice
+            return (
+                "check that the device sends to this computer and port, and that no firewall blocks"
+                " it"
+                if _is_udp(self.sensor)
+                else "check cable, power, settings.baud_rate and settings.start"
+            )
         shown = ", ".join(repr(row[:60].decode("ascii", "replace")) for row in rows[:2])
         guess = guess_settings(rows)
         if guess is None:
@@ -242,17 +193,29 @@ class TextSession(interface.Session):
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Start the device and yield blocks and events."""
-        self.source.discard()
+        self.stream.discard()
         if self.settings.start:
-            await self.source.send(self.settings.start.encode())
+            await self.stream.write(self.settings.start.encode())
+        receive = self._datagram if _is_udp(self.sensor) else self.decoder.receive
         try:
             while True:
-                for item in await self.source.receive():
+                for item in receive(*await self.stream.read()):
                     yield item
         except DeviceError:
             for item in self.decoder.flush():
                 yield item
             raise
+
+    def _datagram(self, received: bytes, at: HostTime) -> list[DeviceItem]:
+        stream = cast("DatagramStream", self.stream)
+        found = self.decoder.receive_datagram(received, at)
+        if any(isinstance(item, Block) for item in found):
+            stream.bind()
+        for host in sorted(stream.strangers - self._told):
+            self._told.add(host)
+            text = f"datagrams from {host} are ignored: another device sends to this port"
+            found.append(Event(self.sensor.name, EventKind.STATUS, text, at))
+        return found
 
 
 class TextDriver(interface.Driver[TextSettings]):
@@ -285,41 +248,38 @@ class TextDriver(interface.Driver[TextSettings]):
             model=sensor.model,
             details={"format": settings.preset if settings.preset != "none" else format_.layout},
         )
-        async with _opened(sensor, clock, settings, decoder, label=port_label(sensors)) as source:
+        async with _opened(sensor, clock, settings) as stream:
             try:
-                yield TextSession(source, settings, (information,), decoder)
+                yield TextSession(stream, sensor, settings, (information,), decoder)
             finally:
                 if settings.stop:
                     with contextlib.suppress(DeviceError):
-                        await source.send(settings.stop.encode())
+                        await stream.write(settings.stop.encode())
 
 
 def _check_port(sensor: Sensor, settings: TextSettings) -> None:
     """Raise BenchFileError for settings that do not apply to the port."""
-    if settings.from_ is not None and not sensor.port.startswith("udp://"):
+    if settings.from_ is not None and not _is_udp(sensor):
         expected = f"is for ports udp://…, not {sensor.port}: leave it out"
         raise sensor.fault("settings.from", expected, settings.from_)
     for key in ("start", "stop"):
-        if sensor.port.startswith("udp://") and (value := getattr(settings, key)):
+        if _is_udp(sensor) and (value := getattr(settings, key)):
             expected = f"nothing can be sent to {sensor.port}: leave it out"
             raise sensor.fault(f"settings.{key}", expected, value)
 
 
-@contextlib.asynccontextmanager
-async def _opened(
-    sensor: Sensor, clock: HostClock, settings: TextSettings, decoder: TextDecoder, *, label: str
-) -> AsyncIterator[_Source]:
-    port = sensor.port
-    if port.startswith("udp://"):
-        async with open_datagrams(
-            port, clock, listen=True, label=label, sender=settings.from_
-        ) as datagrams:
-            yield _DatagramSource(datagrams, decoder, sensor.name)
-    else:
-        async with open_port(
-            port, clock, label=label, baud_rate=settings.baud_rate, parity=settings.parity
-        ) as stream:
-            yield _Source(stream, decoder)
+def _is_udp(sensor: Sensor) -> bool:
+    return sensor.port.startswith("udp://")
+
+
+def _opened(
+    sensor: Sensor, clock: HostClock, settings: TextSettings
+) -> contextlib.AbstractAsyncContextManager[ByteStream | DatagramStream]:
+    port, label = sensor.port, port_label([sensor])
+    if _is_udp(sensor):
+        return open_datagrams(port, clock, listen=True, label=label, sender=settings.from_)
+    rate, parity = settings.baud_rate, settings.parity
+    return open_port(port, clock, label=label, baud_rate=rate, parity=parity)
 
 
 DRIVER = TextDriver()

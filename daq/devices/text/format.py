@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from functools import reduce
 from operator import xor
@@ -76,6 +76,19 @@ class TextFormat:
     hexadecimal_bits: int | None = None
     temperature_column: int | str | None = None
     supply_column: int | str | None = None
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any], names: Iterable[str]) -> TextFormat:
+        """Return the format for settings of a bench file, of channels with these names."""
+        given: dict[str, Any] = {
+            field.name: tuple(value) if isinstance(value, list) else value
+            for field in fields(cls)
+            if (value := settings.get(field.name)) is not None
+        }
+        found = replace(PRESETS[settings.get("preset", "none")], **given)
+        if found.layout != "row":
+            return replace(found, channel_names=given.get("channel_names") or tuple(names))
+        return replace(found, columns=found.columns or tuple(range(len(tuple(names)))))
 
     @property
     def channel_keys(self) -> tuple[int, ...] | tuple[str, ...]:
