@@ -315,13 +315,14 @@ class Connection:
         self._last_session: Session | None = None
         self._detector: StallDetector | None = None
         self._clock = clock
+        self._queue: asyncio.Queue[Item]
 
     async def run(self, queue: asyncio.Queue[Item], start: asyncio.Event) -> None:
         """Connect, wait for ``start``, then read and reconnect until cancelled."""
-        reason = ""
+        self._queue, reason = queue, ""
         while True:
             try:
-                async with self._opened(self._open(), queue) as session:
+                async with self._opened() as session:
                     self._check_identity(session)
                     self._places.connected(self.port)
                     if not self.connected.done():
@@ -334,10 +335,10 @@ class Connection:
                     self._is_connected = True
                     self._last_session = session
                     try:
-                        await self._forward(session, queue)
+                        await self._forward(session)
                     except Exception as error:
                         # Before the driver closes its session, which can take seconds.
-                        reason = await self._report_lost(error, queue)
+                        reason = await self._report_lost(error)
                         raise
                 failure: Exception = NoAnswerError(f"{self.port}: the device ended its session")
             # Third-party drivers may raise anything. An error in one must not end the recording of
@@ -349,9 +350,9 @@ class Connection:
                 return
             # Failed attempts may continue for weeks: only another wrong device is recorded.
             if self._is_connected:
-                reason = await self._report_lost(failure, queue)
+                reason = await self._report_lost(failure)
             elif isinstance(failure, WrongDeviceError) and _summary(failure) != self._reported:
-                await self._report_lost(failure, queue)
+                await self._report_lost(failure)
             await asyncio.sleep(self._back_off.next_delay())
             if isinstance(failure, (NotConnectedError, WrongDeviceError)):
                 self._move_to(self._places.next_place())
@@ -362,29 +363,23 @@ class Connection:
             self.port = port
             self.sensors = tuple(s.model_copy(update={"port": port}) for s in self.sensors)
 
-    def _open(self) -> AbstractAsyncContextManager[Session]:
-        if self._last_session is not None:
-            return self.driver.resume(self.sensors, self._clock, self._last_session)
-        return self.driver.open(self.sensors, self._clock)
-
     @contextlib.asynccontextmanager
-    async def _opened(
-        self, context: AbstractAsyncContextManager[Session], queue: asyncio.Queue[Item]
-    ) -> AsyncIterator[Session]:
+    async def _opened(self) -> AsyncIterator[Session]:
         """Open a session, and close it within ``CLOSE_TIMEOUT``."""
+        if self._last_session is None:
+            context = self.driver.open(self.sensors, self._clock)
+        else:
+            context = self.driver.resume(self.sensors, self._clock, self._last_session)
         session = await context.__aenter__()
         try:
             yield session
         except BaseException as error:
-            await self._close(context, error, queue)
+            await self._close(context, error)
             raise
-        await self._close(context, None, queue)
+        await self._close(context, None)
 
     async def _close(
-        self,
-        context: AbstractAsyncContextManager[Session],
-        error: BaseException | None,
-        queue: asyncio.Queue[Item],
+        self, context: AbstractAsyncContextManager[Session], error: BaseException | None
     ) -> None:
         """Close a session that ended by ``error``; errors of closing must not replace that one."""
         limit = asyncio.timeout(CLOSE_TIMEOUT)
@@ -403,17 +398,17 @@ class Connection:
             text = f"the driver did not close its session within {CLOSE_TIMEOUT:g} s"
             for name in self.names:
                 with contextlib.suppress(asyncio.QueueFull):
-                    queue.put_nowait(Event(name, EventKind.STATUS, text, self._clock.now()))
+                    self._queue.put_nowait(Event(name, EventKind.STATUS, text, self._clock.now()))
 
-    async def _report_lost(self, failure: Exception, queue: asyncio.Queue[Item]) -> EventKind:
+    async def _report_lost(self, failure: Exception) -> EventKind:
         """Report all sensors of the port as lost; return the kind of the event."""
         self._is_connected = False
         kind, _ = self._reported = _summary(failure)
         for name in self.names:
-            await queue.put(SensorLost(Event(name, kind, str(failure), self._clock.now())))
+            await self._queue.put(SensorLost(Event(name, kind, str(failure), self._clock.now())))
         return kind
 
-    async def _forward(self, session: Session, queue: asyncio.Queue[Item]) -> None:
+    async def _forward(self, session: Session) -> None:
         """Forward the items of the session; raise NoAnswerError if it stalls."""
 
         def report(name: str, state: OverdueState, seconds: float) -> bool:
@@ -426,7 +421,7 @@ class Connection:
                 text = f"no block for {seconds:.2g} s; other sensors on the port continue"
                 item = SensorLost(Event(name, EventKind.STALLED, text, now))
             try:
-                queue.put_nowait(item)
+                self._queue.put_nowait(item)
             except asyncio.QueueFull:
                 return False
             return True
@@ -453,11 +448,11 @@ class Connection:
                         item = validator.validated(item)
                         if isinstance(item, Block):
                             if self._clock.suspended > suspended + MIN_SUSPENSION:
-                                suspended = await self._after_suspension(item, suspended, queue)
+                                suspended = await self._after_suspension(item, suspended)
                             detector.block_received(item)
                             lasted_ns = item.received.monotonic_ns - started_ns
                             self._back_off.session_lasted(lasted_ns * 1e-9 / speed)
-                        await queue.put(item)
+                        await self._queue.put(item)
             except TimeoutError as error:
                 if isinstance(error, DeviceError):
                     raise
@@ -469,9 +464,7 @@ class Connection:
             finally:
                 session_ends()
 
-    async def _after_suspension(
-        self, block: Block, before: float, queue: asyncio.Queue[Item]
-    ) -> float:
+    async def _after_suspension(self, block: Block, before: float) -> float:
         """Report a suspension of the computer; return the total time of suspension in s.
 
         Raises
@@ -484,7 +477,7 @@ class Connection:
         text = f"the computer was suspended for {now - before:.3g} s"
         if block.device_counter is None and block.instants_ns is None:
             raise NoAnswerError(f"{self.port}: {text}")
-        await queue.put(Event(block.sensor, EventKind.STATUS, text, self._clock.now()))
+        await self._queue.put(Event(block.sensor, EventKind.STATUS, text, self._clock.now()))
         return now
 
     def _check_identity(self, session: Session) -> None:

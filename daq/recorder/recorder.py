@@ -213,6 +213,8 @@ class _Recorder:
         self._started = self._file_started = self.clock.now()
         self._end_reason = "stopped"
         self._status = RecorderStatus(str(self.path), 0.0, {})
+        self._thread: WritingThread
+        self._writer: BlockWriter
 
     async def run(
         self, duration: float | None, drivers: Callable[[str], AnyDriver], *, anyway: bool
@@ -229,15 +231,16 @@ class _Recorder:
             try:
                 if not await self._all_connected(connections):
                     return self._status
-                with WritingThread() as thread:
-                    writer = await thread.run(lambda: self._create(connections, address, duration))
+                with WritingThread() as self._thread:
+                    create = partial(self._create, connections, address, duration)
+                    self._writer = await self._thread.run(create)
                     try:
                         start.set()
-                        await self._write_until_end(writer, thread, duration, tasks)
+                        await self._write_until_end(duration, tasks)
                         await self._cancel(tasks)
-                        await self._finish(writer, thread)
+                        await self._finish()
                     except BaseException:
-                        await asyncio.shield(thread.run(writer.abandon))
+                        await asyncio.shield(self._thread.run(self._writer.abandon))
                         raise
             finally:
                 await self._cancel(tasks)
@@ -336,14 +339,10 @@ class _Recorder:
         return rows
 
     async def _write_until_end(
-        self,
-        writer: BlockWriter,
-        thread: WritingThread,
-        duration: float | None,
-        tasks: Sequence[asyncio.Task[None]],
+        self, duration: float | None, tasks: Sequence[asyncio.Task[None]]
     ) -> None:
         """Write and commit the items of the connections until the run ends."""
-        loop = asyncio.get_running_loop()
+        loop, writer = asyncio.get_running_loop(), self._writer
         last_commit, n_committed = -math.inf, 0
         watch, host_times = ClockWatch(self.clock), ReadingTimes()
         while not self.stop.is_set():
@@ -353,9 +352,7 @@ class _Recorder:
             now = self.clock.now()
             if host_times.is_due(now) and (celsius := host_temperature()) is not None:
                 batch.append(Reading("", Quantity.TEMPERATURE, celsius, now))
-            await self._done(
-                writer, thread, partial(writer.write, batch), partial(writer.write, ())
-            )
+            await self._done(partial(writer.write, batch), partial(writer.write, ()))
             for task in tasks:
                 if task.done():  # only an error in the program ends a connection
                     task.result()
@@ -363,11 +360,11 @@ class _Recorder:
             interval = MIN_COMMIT_INTERVAL if chunk_waits else COMMIT_INTERVAL
             if loop.time() >= last_commit + interval:
                 n_committed = writer.n_written
-                self._acknowledge(writer, await self._done(writer, thread, writer.commit))
+                self._acknowledge(await self._done(writer.commit))
                 last_commit = loop.time()
-            elif (sensors := self._with_current_states(writer)) != self._status.sensors:
+            elif (sensors := self._with_current_states()) != self._status.sensors:
                 self._publish(replace(self._status, sensors=sensors))
-            if duration is not None and self._is_complete(writer, duration):
+            if duration is not None and self._is_complete(duration):
                 self._end_reason = "duration reached"
                 return
 
@@ -384,27 +381,23 @@ class _Recorder:
             batch.append(self._queue.get_nowait())
         return batch
 
-    async def _finish(self, writer: BlockWriter, thread: WritingThread) -> None:
-        write = partial(writer.write, self._queued())
-        await self._done(writer, thread, write, partial(writer.write, ()))
-        close = partial(writer.close, self.clock.now(), self._end_reason)
-        self._acknowledge(writer, await self._done(writer, thread, close))
+    async def _finish(self) -> None:
+        write = self._writer.write
+        await self._done(partial(write, self._queued()), partial(write, ()))
+        close = partial(self._writer.close, self.clock.now(), self._end_reason)
+        self._acknowledge(await self._done(close))
 
     async def _done(
-        self,
-        writer: BlockWriter,
-        thread: WritingThread,
-        action: Callable[[], _Result],
-        again: Callable[[], _Result] | None = None,
+        self, action: Callable[[], _Result], again: Callable[[], _Result] | None = None
     ) -> _Result:
         """Run `action` on the file; if the disk refuses, run `again` on another file."""
         try:
-            return await thread.run(action)
+            return await self._thread.run(action)
         except DiskError as error:
-            await thread.run(partial(self._continue, writer, error))
-        return await thread.run(again or action)
+            await self._thread.run(partial(self._continue, error))
+        return await self._thread.run(again or action)
 
-    def _continue(self, writer: BlockWriter, error: DiskError) -> None:
+    def _continue(self, error: DiskError) -> None:
         """Continue the recording in another file.
 
         Raises
@@ -417,11 +410,11 @@ class _Recorder:
         if before != self._path and lasted < MIN_CONTINUATION:
             raise DiskError(f"{error}; {self._safe()}") from error
         path = next(each for each in continuation_names(self._path) if not each.exists())
-        attributes: dict[str, str | float] = {CONTINUES: writer.run_id}
+        attributes: dict[str, str | float] = {CONTINUES: self._writer.run_id}
         following = None
         try:
             following = self._new_file(path, created=now, attributes=attributes)
-            writer.continue_in(following)
+            self._writer.continue_in(following)
         except RecordingError:
             if following is not None:
                 following.discard()
@@ -429,7 +422,7 @@ class _Recorder:
         self._file, self._file_started = path, now
         _LOGGER.error("%s; the recording continues in %s", error, path)
         text = f"continues {before.name}, which could no longer be written"
-        writer.write([Event("", EventKind.STATUS, text, now)])
+        self._writer.write([Event("", EventKind.STATUS, text, now)])
 
     def _safe(self) -> str:
         """Return how much of each sensor is safe on the disk."""
@@ -450,8 +443,8 @@ class _Recorder:
             lasts = format_duration(round(free / wanted))
             _LOGGER.log(level, "%.0f MB of free space last for %s or longer", free / 1e6, lasts)
 
-    def _acknowledge(self, writer: BlockWriter, committed: Committed) -> None:
-        sensors = writer.progress(committed)
+    def _acknowledge(self, committed: Committed) -> None:
+        sensors = self._writer.progress(committed)
         self._publish(RecorderStatus(str(self._file), self._elapsed(), sensors, committed.closed))
 
     def _publish(self, status: RecorderStatus) -> None:
@@ -459,16 +452,17 @@ class _Recorder:
         if self.acknowledged is not None:
             self.acknowledged(status)
 
-    def _with_current_states(self, writer: BlockWriter) -> dict[str, SensorProgress]:
+    def _with_current_states(self) -> dict[str, SensorProgress]:
         """Return the last acknowledged counts with the current states."""
-        states = writer.states()
+        states = self._writer.states()
         return {n: replace(one, state=states[n]) for n, one in self._status.sensors.items()}
 
     def _elapsed(self) -> float:
         return (self.clock.now().monotonic_ns - self._started.monotonic_ns) / 1e9
 
-    def _is_complete(self, writer: BlockWriter, duration: float) -> bool:
-        return writer.recorded_seconds() >= duration or self._elapsed() >= duration + _LAST_BLOCKS
+    def _is_complete(self, duration: float) -> bool:
+        recorded = self._writer.recorded_seconds()
+        return recorded >= duration or self._elapsed() >= duration + _LAST_BLOCKS
 
     async def _answer(self, command: Command, text: str) -> dict[str, Any]:
         """Execute a command of the control channel."""

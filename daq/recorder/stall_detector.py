@@ -84,7 +84,8 @@ class BlockInterval:
         self._patience = patience
         self._has_blocks = False
         self._period = 0.0
-        self._longest = before.longest if before else 0.0
+        self.longest: float = before.longest if before else 0.0
+        """Longest recent interval between blocks."""
         self._stalled_since = before.stalled_since if before else None
         self.reported: set[OverdueState] = set()
         """States reported since the last block."""
@@ -99,12 +100,7 @@ class BlockInterval:
         """Seconds after the last block when the sensor is stalled."""
         if not self._has_blocks:
             return self._first_block_timeout
-        return max(self._patience, LATE_PERIODS * self._longest + STALL_MARGIN)
-
-    @property
-    def longest(self) -> float:
-        """Longest recent interval between blocks."""
-        return self._longest
+        return max(self._patience, LATE_PERIODS * self.longest + STALL_MARGIN)
 
     @property
     def stalled_since(self) -> float | None:
@@ -120,9 +116,9 @@ class BlockInterval:
             interval = min(now - self._stalled_since, MAX_LEARNED)
             self._stalled_since = None
         self._period = max(_DECAY * self._period, duration)
-        if self._longest:
-            self._longest *= math.exp(-(now - self.last) / (MEMORY * self._longest))
-        self._longest = max(self._longest, interval, duration)
+        if self.longest:
+            self.longest *= math.exp(-(now - self.last) / (MEMORY * self.longest))
+        self.longest = max(self.longest, interval, duration)
         self._has_blocks, self.last = True, now
         self.reported.clear()
 
@@ -164,15 +160,16 @@ class StallDetector:
         self._is_recovering = is_recovering
         now = self._loop.time()
         timeout = FIRST_BLOCK_TIMEOUT + MAX_FIRST_BLOCK_SAMPLES / min(sampling_rates.values())
-        self._port = BlockInterval(
-            now, timeout, patience=patience, before=before.port if before else None
-        )
-        self._sensors = {
-            name: BlockInterval(
-                now, timeout, patience=patience, before=before.sensor(name) if before else None
-            )
-            for name in sampling_rates
+
+        def interval(earlier: BlockInterval | None) -> BlockInterval:
+            return BlockInterval(now, timeout, patience=patience, before=earlier)
+
+        self.port: BlockInterval = interval(before.port if before else None)
+        """Interval between blocks of any sensor."""
+        self.sensors: dict[str, BlockInterval] = {
+            name: interval(before.sensors[name] if before else None) for name in sampling_rates
         }
+        """Interval between blocks of each sensor."""
         self._timeout = asyncio.timeout(None)
         self._is_waiting = False
         self._due = now
@@ -181,16 +178,7 @@ class StallDetector:
     @property
     def seconds(self) -> float:
         """Seconds since the last block of any sensor."""
-        return self._loop.time() - self._port.last
-
-    @property
-    def port(self) -> BlockInterval:
-        """Interval between blocks of any sensor."""
-        return self._port
-
-    def sensor(self, name: str) -> BlockInterval:
-        """Return the interval between blocks of one sensor."""
-        return self._sensors[name]
+        return self._loop.time() - self.port.last
 
     async def __aenter__(self) -> Self:
         await self._timeout.__aenter__()
@@ -220,8 +208,8 @@ class StallDetector:
         """Record the arrival of a block."""
         now = self._loop.time()
         duration = block.n_samples / self._rates[block.sensor]
-        self._port.block_received(now, duration)
-        interval = self._sensors[block.sensor]
+        self.port.block_received(now, duration)
+        interval = self.sensors[block.sensor]
         interval.block_received(now, duration)
         if now + interval.late_after < self._due and self._timer is not None:
             self._timer.cancel()  # the first block, or blocks became shorter
@@ -230,13 +218,13 @@ class StallDetector:
     def _on_timer(self) -> None:
         now = self._loop.time()
         if now - self._due > BUSY_HOST_DELAY or not self._is_waiting:
-            for interval in (self._port, *self._sensors.values()):
+            for interval in (self.port, *self.sensors.values()):
                 interval.postpone(now)
         else:
             self._report_overdue(now, SensorState.LATE)
-            if now >= self._port.last + MAX_RECOVERY or not self._is_recovering():
-                if now >= self._port.last + self._port.stalled_after:
-                    for interval in (self._port, *self._sensors.values()):
+            if now >= self.port.last + MAX_RECOVERY or not self._is_recovering():
+                if now >= self.port.last + self.port.stalled_after:
+                    for interval in (self.port, *self.sensors.values()):
                         interval.reported.add(SensorState.STALLED)
                     self._timeout.reschedule(now)
                     return
@@ -244,7 +232,7 @@ class StallDetector:
         self._set_timer(now)
 
     def _report_overdue(self, now: float, state: OverdueState) -> None:
-        for name, interval in self._sensors.items():
+        for name, interval in self.sensors.items():
             after = interval.late_after if state is SensorState.LATE else interval.stalled_after
             overdue = state not in interval.reported and now >= interval.last + after
             if overdue and self._report(name, state, now - interval.last):
@@ -252,8 +240,8 @@ class StallDetector:
 
     def _set_timer(self, now: float) -> None:
         """Set the timer to the next time at which a block can be overdue."""
-        due = self._port.last + self._port.stalled_after
-        for interval in self._sensors.values():
+        due = self.port.last + self.port.stalled_after
+        for interval in self.sensors.values():
             if SensorState.LATE not in interval.reported:
                 due = min(due, interval.last + interval.late_after)
             if SensorState.STALLED not in interval.reported:

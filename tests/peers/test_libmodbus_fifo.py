@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.protocols.block import BlockFlag
 from tests.daq.devices.reading import record
 from tests.peers.libmodbus import build, ready, serial_cable
+from tests.sensors import sensor_at
 
 pytestmark = pytest.mark.peer
 
@@ -34,14 +33,8 @@ async def test_our_driver_reads_a_fifo_of_libmodbus(
         serial_cable(tmp_path) as (ours, theirs),
         ready(str(peer), theirs, header),
     ):
-        sensor = Sensor(
-            name="A",
-            driver="fifo",
-            port=ours,
-            sampling_rate=RATE,
-            settings={"header": header, "baud_rate": 230400},
-            channels=tuple(Channel(name=name, sensitivity=835.35) for name in "xyz"),
-        )
+        settings = {"header": header, "baud_rate": 230400}
+        sensor = sensor_at(ours, "fifo", rate=RATE, settings=settings)
         blocks, events = await record(driver_type("fifo"), sensor, 3000)
     assert not events
     assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.protocols.block import Block, Event, EventKind
 from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.devices import host_clock, serving
 from tests.peers.libmodbus import build, ready, running, serial_cable
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, scenario, spec
 
 pytestmark = [pytest.mark.devices, pytest.mark.peer]
@@ -127,14 +126,7 @@ async def _polled(port: str, settings: dict[str, Any]) -> list[list[int]]:
     Register 0 counts the requests. A busy computer may answer late: the driver asks again, and
     says that the device stalled, once for several requests.
     """
-    sensor = Sensor(
-        name="A",
-        driver="registers",
-        port=port,
-        sampling_rate=100.0,
-        settings=settings,
-        channels=tuple(Channel(name=name, sensitivity=1.0) for name in ("n", "a", "b")),
-    )
+    sensor = sensor_at(port, "registers", rate=100.0, channels=("n", "a", "b"), settings=settings)
     rows: list[list[int]] = []
     has_stalled = False
     async with driver_type("registers").open([sensor], host_clock()) as session:

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.guralp import brp, gcf, scream
 from daq.devices.guralp.decoders import ScreamDecoder, SerialDecoder
 from daq.devices.guralp.gcf import SampleBlock
@@ -23,6 +21,7 @@ from sim_devices.devices.guralp import Digitizer
 from sim_devices.devices.interface import ChannelSpec, DeviceSpec, Source
 from sim_devices.world.world import World
 from tests.daq.devices.reading import record
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import scenario
 from tests.tcp import served
 
@@ -174,14 +173,8 @@ async def test_our_driver_reads_what_obspy_wrote(frames: list[bytes]) -> None:
         await reader.read()
 
     async with served(send) as number:
-        sensor = Sensor(
-            name="A",
-            driver="guralp",
-            port=f"socket://127.0.0.1:{number}",
-            sampling_rate=100.0,
-            settings={"streams": STREAMS},
-            channels=tuple(Channel(name=name, sensitivity=1.0) for name in "ZNE"),
-        )
+        port, settings = f"socket://127.0.0.1:{number}", {"streams": STREAMS}
+        sensor = sensor_at(port, "guralp", rate=100.0, channels="ZNE", settings=settings)
         blocks, events = await record(driver_type("guralp"), sensor, 2000)
     assert not events
     np.testing.assert_array_equal(np.concatenate([b.counts for b in blocks]), counts)

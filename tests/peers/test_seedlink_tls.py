@@ -21,8 +21,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.seedlink.decoder import WaveRecord, encode_record
 from daq.errors import WrongDeviceError
@@ -31,6 +29,7 @@ from daq.protocols.block import Block
 from sim_devices.server.serve import self_signed
 from tests.acceptance.ringserver import Feeder
 from tests.devices import serving
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, spec
 from tests.waiting import limit, wait_until
 
@@ -141,14 +140,9 @@ async def test_our_driver_reads_ringserver(server: tuple[int, str], tmp_path: Pa
     number, certificate = server
     driver, found = driver_type("seedlink"), []
     settings = {"network": "XX", "station": "STA", "tls": True, "ca_file": certificate}
-    chosen = Sensor(
-        name="A",
-        driver="seedlink",
-        port=f"seedlink://localhost:{number}",
-        sampling_rate=RATE,
-        channels=tuple(Channel(name=name, sensitivity=1.0) for name in CHANNELS),
-        settings={**settings, "credentials": str(tmp_path / "credentials")},
-    )
+    settings["credentials"] = str(tmp_path / "credentials")
+    port = f"seedlink://localhost:{number}"
+    chosen = sensor_at(port, "seedlink", rate=RATE, channels=CHANNELS, settings=settings)
     (tmp_path / "credentials").write_text("lab wrong", encoding="utf-8")
     with pytest.raises(WrongDeviceError, match="'AUTH …', got 'ERROR AUTH"):
         async with driver.open([chosen], SystemClock()):

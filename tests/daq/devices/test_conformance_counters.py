@@ -5,20 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.conformance.suite import check_counters
 from daq.protocols.block import Block, HostTime
+from tests.sensors import sensor_at
 
 RATE = 100.0
-SENSOR = Sensor(
-    name="one",
-    driver="text",
-    port="socket://localhost:1",
-    sampling_rate=RATE,
-    channels=(Channel(name="x", sensitivity=1e6),),
-    settings={"columns": (0,)},
-)
+SENSOR = sensor_at("socket://localhost:1", "text", "one", rate=RATE, channels="x")
 FIRST = np.concatenate([[0], np.cumsum(np.resize([1, 3, 2, 7], 60))])
 """Index of the first sample of each block: blocks of one to seven samples."""
 

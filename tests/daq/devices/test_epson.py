@@ -8,8 +8,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.commands import CommandDecoder, Read, Write
 from daq.devices.epson.driver import Configuration, Device, EpsonSession, EpsonSettings
@@ -18,18 +16,13 @@ from daq.errors import NoAnswerError
 from daq.protocols.block import Block, HostTime
 from daq.transport.byte_stream import ByteStream
 from tests.devices import host_clock
+from tests.sensors import sensor_at
 
 pytestmark = pytest.mark.virtual_time
 
 COMMAND_INTERVAL = 350e-6
 """M-A352AD10 data sheet, TWRITECYC and TREADCYC: from one command to the next, s."""
-SENSOR = Sensor(
-    name="A",
-    driver="epson",
-    port="strict",
-    sampling_rate=200.0,
-    channels=(Channel(name="x", sensitivity=1.0),),
-)
+SENSOR = sensor_at("strict", "epson", rate=200.0, channels="x")
 
 
 class StrictDevice:

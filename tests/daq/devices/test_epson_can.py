@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import Sent, check_blocks, check_counters, check_truth
 from daq.devices.epson import can_driver
@@ -28,6 +27,7 @@ from daq.host_clock import SystemClock
 from daq.protocols import block
 from daq.protocols.block import Block, BlockFlag, DeviceItem, HostTime, Quantity, Reading
 from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus, encode_sample
+from tests.sensors import sensor_at
 
 RATE = 100.0
 DRIVER = driver_type("epson-can")
@@ -59,17 +59,11 @@ def serving(*nodes: int) -> Iterator[tuple[SimulatedBus, str]]:
 
 
 def sensors(channel: str, *names: str, **changes: object) -> list[Sensor]:
-    return [
-        Sensor(
-            name=name,
-            driver="epson-can",
-            port=f"can://{channel}",
-            sampling_rate=RATE,
-            channels=tuple(Channel(name=axis, sensitivity=1.7e6) for axis in "xyz"),
-            settings={"node_id": NODES[name], "interface": "virtual", **changes},
-        )
-        for name in names
-    ]
+    found = []
+    for name in names:
+        own = {"node_id": NODES[name], "interface": "virtual", **changes}
+        found.append(sensor_at(f"can://{channel}", "epson-can", name, rate=RATE, settings=own))
+    return found
 
 
 async def read(bench: list[Sensor], n_samples: int) -> list[DeviceItem]:

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import CuttingClock
 from daq.devices.guralp.brp import encode_frame
@@ -24,6 +23,7 @@ from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Block
 from daq.protocols.errors import RemoteProtocolError
 from tests.daq.devices.guralp.sample_blocks import RATE, expected, raw_blocks
+from tests.sensors import sensor_at
 from tests.waiting import limit
 
 
@@ -42,14 +42,8 @@ async def test_a_line_that_hangs_up_before_the_reply_loses_no_block(
 ) -> None:
     """Güralp on a serial line: the acknowledgement cannot be sent, the block was received."""
     master, port = terminal
-    sensor = Sensor(
-        name="A",
-        driver="guralp",
-        port=port,
-        sampling_rate=RATE,
-        channels=tuple(Channel(name=name, sensitivity=1.0) for name in "ZNE"),
-        settings={"streams": ["DEMOZ2", "DEMON2", "DEMOE2"]},
-    )
+    settings = {"streams": ["DEMOZ2", "DEMON2", "DEMOE2"]}
+    sensor = sensor_at(port, "guralp", rate=RATE, channels="ZNE", settings=settings)
     frames = [encode_frame(n, block) for n, block in enumerate(raw_blocks(3))]
     clock = CuttingClock(SystemClock(), lambda: os.close(master))
     found, loop = list[Block](), asyncio.get_running_loop()
@@ -107,14 +101,7 @@ async def test_readings_collected_when_the_line_hangs_up_are_handed_on(
     """Rows are collected to blocks; those of an incomplete block were read nevertheless."""
     master, port = terminal
     settings: dict[str, object] = {"address": 0} if driver == "registers" else {"set_rate": False}
-    sensor = Sensor(
-        name="A",
-        driver=driver,
-        port=port,
-        sampling_rate=20.0,
-        channels=tuple(Channel(name=name, sensitivity=1.0) for name in "xyz"),
-        settings=settings | {"baud_rate": 115200},
-    )
+    sensor = sensor_at(port, driver, rate=20.0, settings=settings | {"baud_rate": 115200})
     slave = _Slave(master, 8, header=driver == "fifo")
     asyncio.get_running_loop().add_reader(master, slave.readable)
     found = list[Block]()

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance.suite import PAUSE, DriverConformance, Sent, Served, check_truth
 from daq.devices.interface import PresentPort
@@ -29,6 +28,7 @@ from daq.devices.ni_daqmx import DRIVER
 from daq.errors import BenchFileError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
+from tests.sensors import sensor_at
 
 RATE = 2048.0
 INPUTS = {"A": (0, 1, 2), "B": (5, 7, 4)}
@@ -122,20 +122,11 @@ def _found_at(monkeypatch: pytest.MonkeyPatch, path: str | None) -> None:
 
 
 def sensors(port: str = "ni://cDAQ1", **settings: object) -> list[Sensor]:
-    return [
-        Sensor(
-            name=name,
-            driver="nidaqmx",
-            port=port,
-            sampling_rate=RATE,
-            channels=tuple(Channel(name=axis, sensitivity=0.1) for axis in "xyz"),
-            settings={
-                "inputs": [f"Mod{1 + k // 4}/ai{k % 4}" for k in INPUTS[name]],
-                **settings,
-            },
-        )
-        for name in INPUTS
-    ]
+    found = []
+    for name, numbers in INPUTS.items():
+        own = {"inputs": [f"Mod{1 + k // 4}/ai{k % 4}" for k in numbers], **settings}
+        found.append(sensor_at(port, "nidaqmx", name, rate=RATE, settings=own))
+    return found
 
 
 class TestNiDaqmx(DriverConformance):

@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.bench.tables.toml_text import to_toml
 from daq.devices.bench_file import parse
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError
+from tests.sensors import sensor_at
 
 LABJACK, SCREAM, BUS = "modbus-tcp://10.0.0.5", "udp://10.0.0.6:1567", "/dev/ttyUSB0"
 ZNE, OTHERS = ["0123Z2", "0123N2", "0123E2"], ["0124Z2", "0124N2", "0124E2"]
@@ -130,14 +129,7 @@ def test_valid_combinations_of_sensors_are_accepted(
 ) -> None:
     driver_type(driver).check(
         [
-            Sensor(
-                name=name,
-                driver=driver,
-                port=port,
-                sampling_rate=200.0,
-                settings=own,
-                channels=tuple(Channel(name=axis, sensitivity=1e6) for axis in "xyz"),
-            )
+            sensor_at(port, driver, name, rate=200.0, settings=own)
             for name, own in zip("AB", settings, strict=False)
         ]
     )

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from pymodbus.transaction import TransactionManager
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.modbus import rtu
 from daq.devices.modbus.bus import open_bus
@@ -21,6 +20,7 @@ from daq.devices.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.protocols.block import Block, Event
 from tests.devices import host_clock
+from tests.sensors import sensor_at
 from tests.tcp import served
 
 pytestmark = pytest.mark.virtual_time
@@ -48,14 +48,7 @@ def reply(n: int, *, unit: int = 1) -> bytes:
 
 
 def sensor(port: str, **settings: object) -> Sensor:
-    return Sensor(
-        name="A",
-        driver="registers",
-        port=port,
-        sampling_rate=RATE,
-        channels=tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz"),
-        settings={"address": 0, **settings},
-    )
+    return sensor_at(port, "registers", rate=RATE, settings={"address": 0, **settings})
 
 
 async def polled(one: Sensor, n_polls: int) -> tuple[int, int, Counter[str]]:

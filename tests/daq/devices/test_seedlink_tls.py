@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.errors import BenchFileError, NotConnectedError, WrongDeviceError
 from sim_devices.server.launch import RunningDevice
 from tests.daq.devices.reading import record
 from tests.devices import host_clock, serving
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, spec
 
 DRIVER = driver_type("seedlink")
@@ -23,14 +23,8 @@ devices = pytest.mark.devices
 
 
 def sensor(port: str, **settings: Any) -> Sensor:  # noqa: ANN401 -- whatever settings hold
-    return Sensor(
-        name="A",
-        driver="seedlink",
-        port=port,
-        sampling_rate=200.0,
-        channels=tuple(Channel(name=name, sensitivity=1e6) for name in ("HNZ", "HNN", "HNE")),
-        settings={"network": "XX", "station": "STA", "patience": 20.0, **settings},
-    )
+    own = {"network": "XX", "station": "STA", "patience": 20.0, **settings}
+    return sensor_at(port, "seedlink", rate=200.0, channels=("HNZ", "HNN", "HNE"), settings=own)
 
 
 @pytest.fixture

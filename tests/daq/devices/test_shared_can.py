@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
@@ -18,6 +17,7 @@ from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind
 from tests.daq.devices.can_peer import Peer
+from tests.sensors import sensor_at
 from tests.waiting import limit, wait_until
 
 RATE = 100.0
@@ -31,17 +31,10 @@ pytestmark = pytest.mark.peer
 def bus() -> Iterator[tuple[Peer, list[Sensor]]]:
     channel = f"huddle-shared-{next(_channels)}"
     peer = Peer(channel, list(NODES.values()), RATE)
-    sensors = [
-        Sensor(
-            name=name,
-            driver="epson-can",
-            port=f"can://{channel}",
-            sampling_rate=RATE,
-            channels=tuple(Channel(name=axis, sensitivity=1.7e6) for axis in "xyz"),
-            settings={"node_id": node, "interface": "virtual"},
-        )
-        for name, node in NODES.items()
-    ]
+    sensors = []
+    for name, node in NODES.items():
+        own = {"node_id": node, "interface": "virtual"}
+        sensors.append(sensor_at(f"can://{channel}", "epson-can", name, rate=RATE, settings=own))
     try:
         yield peer, sensors
     finally:

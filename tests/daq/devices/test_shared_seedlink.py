@@ -11,7 +11,6 @@ from contextlib import AbstractAsyncContextManager
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.conformance import suite
 from daq.conformance.suite import DriverConformance, Served
@@ -24,6 +23,7 @@ from daq.errors import NotConnectedError, WrongDeviceError
 from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Block, DeviceItem, Event, EventKind
 from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, record, value
+from tests.sensors import sensor_at
 from tests.waiting import limit, wait_until
 
 DRIVER = driver_type("seedlink")
@@ -31,17 +31,12 @@ NAMES = ["AAA", "BBB", "CCC"]
 
 
 def sensors(port: str, patience: float = 60.0) -> list[Sensor]:
-    return [
-        Sensor(
-            name=name,
-            driver="seedlink",
-            port=port,
-            sampling_rate=RATE,
-            channels=(Channel(name="HNZ", sensitivity=1e6),),
-            settings={"network": "XX", "station": name, "late": 0.2, "patience": patience},
-        )
-        for name in NAMES
-    ]
+    found = []
+    for name in NAMES:
+        own = {"network": "XX", "station": name, "late": 0.2, "patience": patience}
+        one = sensor_at(port, "seedlink", name, rate=RATE, channels=["HNZ"], settings=own)
+        found.append(one)
+    return found
 
 
 class Reader:

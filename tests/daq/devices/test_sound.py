@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.sound import FULL_SCALE, Capture
 from daq.errors import BenchFileError
 from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
+from tests.sensors import sensor_at
 from tests.waiting import limit
 
 RATE = 8000.0
@@ -166,14 +165,8 @@ def test_clipping_is_flagged() -> None:
 def test_impossible_settings_are_refused(
     port: str, inputs: tuple[int, ...] | None, said: str
 ) -> None:
-    one = Sensor(
-        name="A",
-        driver="sound",
-        port=port,
-        sampling_rate=RATE,
-        channels=(Channel(name="x", sensitivity=1.0), Channel(name="y", sensitivity=1.0)),
-        settings={} if inputs is None else {"inputs": inputs},
-    )
+    settings = {} if inputs is None else {"inputs": inputs}
+    one = sensor_at(port, "sound", rate=RATE, channels="xy", settings=settings)
     assert hasattr(DRIVER, "check")
     with pytest.raises(BenchFileError, match=said):
         DRIVER.check([one])

@@ -13,8 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
@@ -22,6 +20,7 @@ from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
 from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
+from tests.sensors import sensor_at
 from tests.tcp import served
 
 ROWS = TextFormat(columns=(1, 2, 3), time_column=0, whole=True)
@@ -124,14 +123,8 @@ async def test_a_row_that_begins_a_jump_before_a_hang_up_is_recorded() -> None:
 
     numbers: list[int] = []
     async with served(serve) as number:
-        one = Sensor(
-            name="A",
-            driver="text",
-            port=f"socket://127.0.0.1:{number}",
-            sampling_rate=100.0,
-            channels=(Channel(name="X", sensitivity=1.0),),
-            settings={"columns": [1], "time_column": 0},
-        )
+        port, settings = f"socket://127.0.0.1:{number}", {"columns": [1], "time_column": 0}
+        one = sensor_at(port, "text", rate=100.0, channels="X", settings=settings)
         async with driver_type("text").open([one], SystemClock()) as session:
             with contextlib.suppress(NotConnectedError):
                 async for item in session.read():
