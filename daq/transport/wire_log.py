@@ -152,10 +152,6 @@ class ReplayedStream(ByteStream):
 
     async def write(self, payload: bytes) -> None:
         """Compare what is sent with what was sent."""
-        self.send(payload)
-
-    def send(self, payload: bytes) -> None:
-        """Compare what is sent with what was sent."""
         self._to_send += payload
         while self._to_send:
             line = next((line for line in self._lines if line.kind != "in"), None)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -45,14 +46,7 @@ from daq.transport.ports import open_port
 from daq.transport.udp import DatagramStream, open_datagrams
 
 if TYPE_CHECKING:
-    from collections.abc import (
-        AsyncGenerator,
-        AsyncIterator,
-        Callable,
-        Collection,
-        Mapping,
-        Sequence,
-    )
+    from collections.abc import AsyncGenerator, AsyncIterator, Collection, Mapping, Sequence
 
     from daq.bench.model import Sensor
     from daq.host_clock import HostClock
@@ -250,19 +244,100 @@ COMPONENTS = "ZNEX1234"
 
 @dataclass(eq=False)
 class GuralpSession(Session):
-    """A session in which every stream has been received once."""
+    """A session in which every stream has been received once: see :meth:`listen`."""
 
     hint = "check the digitizer's terminal, cable and power"
 
     link: Link
-    information: tuple[DeviceInformation, ...]
-    buffered: list[DeviceItem]
-    identify: Callable[[str], DeviceInformation]
-    patience: float
+    sensors: Mapping[str, Sensor]
+    settings: Mapping[str, GuralpSettings]
+    label: str
 
     def __post_init__(self) -> None:
-        self._absent = {one.sensor for one in self.information if one.trouble}
+        self.patience = next(iter(self.settings.values())).patience
+        self._buffered: list[DeviceItem] = []
+        self._absent: set[str] = set()
         self._refused: set[str] = set()
+
+    async def discover(self) -> None:
+        """Listen until one digitizer has sent as many streams as the only sensor has channels."""
+        ((name, sensor),) = self.sensors.items()
+        n_channels, streams = len(sensor.channels), self.link.streams
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.patience):
+                while True:
+                    found = [*await self.link.receive(), *await self.link.respond()]
+                    self._buffered += [
+                        replace(item, sensor=name) for item in found if isinstance(item, Event)
+                    ]
+                    if not streams.repeated:
+                        continue
+                    by_serial: defaultdict[str, list[str]] = defaultdict(list)
+                    for stream in streams.unknown:
+                        by_serial[serial_number(stream)].append(stream)
+                    for own in by_serial.values():
+                        if len(own) == n_channels:
+                            self._buffered += streams.assign(name, sorted(own, key=_component))
+                            return
+        received = ", ".join(sorted(streams.unknown)) or "nothing"
+        raise NoAnswerError(
+            f"{self.label}: expected {n_channels} streams of one digitizer, received {received} in"
+            f" {self.patience:g} s; set settings.streams"
+        )
+
+    async def listen(self) -> None:
+        """Listen until every stream has been received, and identify each sensor.
+
+        If only some of several sensors send, the session starts with them: the others may follow.
+        """
+        streams = self.link.streams
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.patience):
+                while streams.silent:
+                    self._buffered += await self.link.receive()
+                    self._buffered += await self.link.respond()
+        information = []
+        for name in self.sensors:
+            silent = set(streams.stream_ids(name)).intersection(streams.silent)
+            if not silent:
+                information.append(self._identity(name))
+                continue
+            others = ", ".join(sorted(streams.unknown)) or "no other"
+            trouble = (
+                f"{self.label}: streams {', '.join(sorted(silent))} of {name!r} not received within"
+                f" {self.patience:g} s; received {others}"
+            )
+            information.append(DeviceInformation(sensor=name, trouble=trouble))
+            self._absent.add(name)
+        if len(self._absent) == len(information):
+            raise NoAnswerError(information[0].trouble)
+        self.information = tuple(information)
+
+    def _identity(self, name: str) -> DeviceInformation:
+        """Return the information of a sensor; raise WrongDeviceError for another device."""
+        streams, sensor = self.link.streams, self.sensors[name]
+        ids, system = streams.stream_ids(name), streams.system(name)
+        for what, expected, found in (
+            ("serial number", sensor.serial_number, serial_number(ids[0])),
+            ("system ID", self.settings[name].system_id, system),
+        ):
+            if expected and expected != found:
+                raise WrongDeviceError(
+                    f"{self.label}: expected {what} {expected!r}, got {found!r}", found=found
+                )
+        rate = streams.sampling_rate(name)
+        if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-9:
+            raise WrongDeviceError(
+                f"{self.label}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz; set the"
+                " digitizer, or sampling_rate"
+            )
+        return DeviceInformation(
+            sensor=name,
+            model="Güralp digitizer",
+            serial_number=serial_number(ids[0]),
+            sampling_rate=rate,
+            details={"system ID": system, "streams": ", ".join(ids)},
+        )
 
     async def read(self) -> AsyncIterator[DeviceItem]:
         """Yield blocks and events."""
@@ -276,7 +351,7 @@ class GuralpSession(Session):
                 yield item
 
     async def _received(self) -> AsyncGenerator[DeviceItem]:
-        buffered, self.buffered = self.buffered, []
+        buffered, self._buffered = self._buffered, []
         for item in buffered:
             yield item
         try:
@@ -294,7 +369,7 @@ class GuralpSession(Session):
         """Identify a sensor whose streams were missing at the start; exclude a wrong device."""
         self._absent.discard(first.sensor)
         try:
-            self.identify(first.sensor)
+            self._identity(first.sensor)
         except WrongDeviceError as error:
             self._refused.add(first.sensor)
             return Event(first.sensor, EventKind.REFUSED, str(error)[:200], first.received)
@@ -330,19 +405,11 @@ class GuralpDriver(Driver[GuralpSettings]):
         every, ids = self.check(sensors)
         settings, label = every[first.name], port_label(sensors)
         async with open_link(first.port, settings, clock, ids, label=label) as link:
-            buffered: list[DeviceItem] = []
+            session = GuralpSession(link, {one.name: one for one in sensors}, every, label)
             if not ids[first.name]:
-                await _discover(link, first, settings, label, buffered)
-            by_name = {sensor.name: sensor for sensor in sensors}
-            yield GuralpSession(
-                link,
-                patience=settings.patience,
-                information=await _listen(link, sensors, every, label, buffered),
-                buffered=buffered,
-                identify=lambda name: _identity(
-                    link.streams, by_name[name], every[name].system_id, label
-                ),
-            )
+                await session.discover()
+            await session.listen()
+            yield session
 
 
 def _stream_ids(
@@ -365,103 +432,8 @@ def _stream_ids(
     return inputs_of(sensors, given, key="streams", what="a stream")
 
 
-async def _discover(
-    link: Link,
-    sensor: Sensor,
-    settings: GuralpSettings,
-    label: str,
-    buffered: list[DeviceItem],
-) -> None:
-    """Listen until one digitizer has sent as many streams as the sensor has channels."""
-    n_channels = len(sensor.channels)
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(settings.patience):
-            while True:
-                found = [*await link.receive(), *await link.respond()]
-                buffered += [
-                    replace(item, sensor=sensor.name) for item in found if isinstance(item, Event)
-                ]
-                if not link.streams.repeated:
-                    continue
-                by_serial: dict[str, list[str]] = {}
-                for stream in link.streams.unknown:
-                    by_serial.setdefault(serial_number(stream), []).append(stream)
-                for streams in by_serial.values():
-                    if len(streams) == n_channels:
-                        buffered += link.streams.assign(
-                            sensor.name, sorted(streams, key=_component)
-                        )
-                        return
-    received = ", ".join(sorted(link.streams.unknown)) or "nothing"
-    raise NoAnswerError(
-        f"{label}: expected {n_channels} streams of one digitizer, received {received} in"
-        f" {settings.patience:g} s; set settings.streams"
-    )
-
-
 def _component(stream: str) -> tuple[int, str]:
     return COMPONENTS.find(component(stream)) % (len(COMPONENTS) + 1), stream
-
-
-async def _listen(
-    link: Link,
-    sensors: Sequence[Sensor],
-    every: Mapping[str, GuralpSettings],
-    label: str,
-    buffered: list[DeviceItem],
-) -> tuple[DeviceInformation, ...]:
-    """Listen until every stream has been received; return the information of each sensor.
-
-    If only some of several sensors send, the session starts with them: the others may follow.
-    """
-    patience = every[sensors[0].name].patience
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(patience):
-            while link.streams.silent:
-                buffered += await link.receive()
-                buffered += await link.respond()
-    information = []
-    for sensor in sensors:
-        silent = set(link.streams.stream_ids(sensor.name)).intersection(link.streams.silent)
-        if not silent:
-            wanted = every[sensor.name].system_id
-            information.append(_identity(link.streams, sensor, wanted, label))
-            continue
-        others = ", ".join(sorted(link.streams.unknown)) or "no other"
-        trouble = (
-            f"{label}: streams {', '.join(sorted(silent))} of {sensor.name!r} not received within"
-            f" {patience:g} s; received {others}"
-        )
-        information.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
-    if all(one.trouble for one in information):
-        raise NoAnswerError(information[0].trouble)
-    return tuple(information)
-
-
-def _identity(streams: Streams, sensor: Sensor, system_id: str, label: str) -> DeviceInformation:
-    ids = streams.stream_ids(sensor.name)
-    rate = streams.sampling_rate(sensor.name)
-    system = streams.system(sensor.name)
-    for what, expected, found in (
-        ("serial number", sensor.serial_number, serial_number(ids[0])),
-        ("system ID", system_id, system),
-    ):
-        if expected and expected != found:
-            raise WrongDeviceError(
-                f"{label}: expected {what} {expected!r}, got {found!r}", found=found
-            )
-    if rate is not None and abs(rate / sensor.sampling_rate - 1) > 1e-9:
-        raise WrongDeviceError(
-            f"{label}: expected {sensor.sampling_rate:g} Hz, got {rate:g} Hz; set the digitizer, or"
-            " sampling_rate"
-        )
-    return DeviceInformation(
-        sensor=sensor.name,
-        model="Güralp digitizer",
-        serial_number=serial_number(ids[0]),
-        sampling_rate=rate,
-        details={"system ID": system, "streams": ", ".join(ids)},
-    )
 
 
 DRIVER = GuralpDriver()

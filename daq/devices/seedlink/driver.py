@@ -165,7 +165,7 @@ class SeedLinkSession(Session):
                 yield item
             self.decoder.check()
             for presence in [one for one in refused.values() if one.is_due]:
-                for event in await presence.try_again(partial(link.replace, presence.sensor)):
+                for event in await presence.try_again(partial(link.connect, presence.sensor)):
                     yield event
                 for item in link.taken():
                     yield item
@@ -187,22 +187,40 @@ class _Link:
         self.refused: dict[str, str] = {}
         """Why the server refused the station of a sensor."""
         self.server: _Server
-        self._first = self.sensors[0]
         self._found: list[Block | Event] = []
         self._stack = contextlib.AsyncExitStack()
 
-    async def open(self) -> None:
-        """Connect, and select all stations that the server has."""
-        stack, server, refused = await self._connected("")
-        self._stack, self.server, self.refused = stack, server, refused
-        self._begin()
+    async def connect(self, wanted: str = "") -> None:
+        """Connect, select all stations that the server has, and close the connection before.
 
-    async def replace(self, sensor: str) -> None:
-        """Connect again with the station of a sensor, and close the connection before."""
-        stack, server, refused = await self._connected(sensor)
-        before, self._stack, self.server, self.refused = self._stack, stack, server, refused
+        Raises
+        ------
+        WrongDeviceError
+            If the server refuses the station of the sensor ``wanted``, or all stations.
+        """
+        settings = self.settings
+        host, number = self.planned.address
+        tls = None
+        if settings.is_encrypted(number):
+            try:
+                tls = await asyncio.to_thread(settings.context)
+            except OSError as error:
+                text = f"{self.label}: settings.ca_file cannot be read: {error}"
+                raise NotConnectedError(text) from error
+        async with contextlib.AsyncExitStack() as stack:
+            address = f"socket://{host}:{number}"
+            opening = open_port(address, self.clock, label=self.label, tls=tls)
+            server = _Server(await stack.enter_async_context(opening), is_encrypted=tls is not None)
+            await server.greet(settings.protocol)
+            if settings.credentials is not None:
+                await server.authenticate(settings.read_credentials(self.sensors[0]))
+            chosen = await server.choose(self.planned.selections, self.decoder.last, wanted=wanted)
+            before, self._stack = self._stack, stack.pop_all()
+        self.server, self.refused = server, chosen
         await before.aclose()
-        self._begin()
+        self.decoder.begin(server.version)
+        if server.rest is not None:
+            self._found += self.decoder.receive(*server.rest)
 
     async def read(self, refused: Iterable[Presence]) -> tuple[bytes, HostTime]:
         """Return received bytes, or none when a refused station is due."""
@@ -227,35 +245,6 @@ class _Link:
     async def aclose(self) -> None:
         """Close the connection."""
         await self._stack.aclose()
-
-    def _begin(self) -> None:
-        self.decoder.begin(self.server.version)
-        if self.server.rest is not None:
-            self._found += self.decoder.receive(*self.server.rest)
-
-    async def _connected(
-        self, wanted: str
-    ) -> tuple[contextlib.AsyncExitStack, _Server, dict[str, str]]:
-        """Connect; raise WrongDeviceError if the server refuses ``wanted``, or all stations."""
-        settings, label = self.settings, self.label
-        host, number = self.planned.address
-        tls = None
-        if settings.is_encrypted(number):
-            try:
-                tls = await asyncio.to_thread(settings.context)
-            except OSError as error:
-                text = f"{label}: settings.ca_file cannot be read: {error}"
-                raise NotConnectedError(text) from error
-        async with contextlib.AsyncExitStack() as stack:
-            stream = await stack.enter_async_context(
-                open_port(f"socket://{host}:{number}", self.clock, label=label, tls=tls)
-            )
-            server = _Server(stream, is_encrypted=tls is not None)
-            await server.greet(settings.protocol)
-            if settings.credentials is not None:
-                await server.authenticate(settings.read_credentials(self._first))
-            refused = await server.choose(self.planned.selections, self.decoder.last, wanted=wanted)
-            return stack.pop_all(), server, refused
 
 
 class SeedLinkDriver(Driver[SeedLinkSettings]):
@@ -313,14 +302,10 @@ async def _opened(
         decoder = SeedLinkDecoder(planned.selections, dtypes, hold=late)
     link = _Link(planned, sensors, clock, decoder)
     async with contextlib.aclosing(link):
-        await link.open()
+        await link.connect()
         decoder.waiting += link.taken()
         await _listen(link)
-        yield SeedLinkSession(
-            link,
-            information=_information(planned, sensors, link),
-            resumed=before is not None,
-        )
+        yield SeedLinkSession(link, _information(link), resumed=before is not None)
 
 
 class _Server:
@@ -450,12 +435,10 @@ async def _listen(link: _Link) -> None:
                 link.decoder.waiting += link.decoder.receive(received, at)
 
 
-def _information(
-    planned: _Planned, sensors: Sequence[Sensor], link: _Link
-) -> tuple[DeviceInformation, ...]:
+def _information(link: _Link) -> tuple[DeviceInformation, ...]:
     found, decoder, server = [], link.decoder, link.server
-    for sensor in sensors:
-        if trouble := _trouble(planned, sensor, link):
+    for sensor in link.sensors:
+        if trouble := _trouble(sensor, link):
             found.append(DeviceInformation(sensor=sensor.name, trouble=trouble))
             continue
         details = {
@@ -478,14 +461,14 @@ def _information(
     return tuple(found)
 
 
-def _trouble(planned: _Planned, sensor: Sensor, link: _Link) -> str:
+def _trouble(sensor: Sensor, link: _Link) -> str:
     """Return why a sensor is not read; empty if it is."""
     decoder, name = link.decoder, sensor.name
     if name not in decoder.silent or name in link.refused:
         return link.refused.get(name, "")
     if why := decoder.refused.get(name):
         return f"{link.label}: {name!r}: {why}"
-    settings, there = planned.settings[name], ", ".join(decoder.heard(name)) or "none"
+    settings, there = link.planned.settings[name], ", ".join(decoder.heard(name)) or "none"
     return (
         f"{link.label}: the {len(sensor.channels)} streams of {name!r} not received in"
         f" {settings.patience:g} s; of {settings.network}.{settings.station} that match: {there}"
