@@ -196,6 +196,13 @@ class Registers:
         values = await self.do(f"reading register {address}", ReadAt(address, 2))
         return float(struct.unpack(">f", values)[0])
 
+    async def flash(self, address: int, n_registers: int) -> bytes:
+        """Read the internal flash, where the calibration is."""
+        pointer = long(reg.FLASH_READ_POINTER, address)
+        return await self.do(
+            "reading the calibration", pointer, ReadAt(reg.FLASH_READ, n_registers)
+        )
+
     async def stop_stream(self) -> None:
         """Stop the stream, if one is running."""
         with contextlib.suppress(RemoteProtocolError):  # 2620: no stream is running
@@ -342,46 +349,51 @@ async def set_inputs(
 
 
 @dataclass(frozen=True, slots=True)
-class StreamPlan:
-    """Parameters of the stream."""
+class Plan:
+    """Settings of one device in the bench file, and its stream."""
 
-    scan_list: tuple[int, ...]
+    settings: dict[str, LabJackSettings]
+    inputs: dict[str, tuple[int, ...]]
     rate: float
-    packet_size: int
+    address: tuple[str, int]
+
+    @property
+    def common(self) -> LabJackSettings:
+        """Settings of the first sensor, which apply to the device."""
+        return next(iter(self.settings.values()))
+
+    @property
+    def scan_list(self) -> tuple[int, ...]:
+        """Addresses that the device scans."""
+        timer = labjack.TIMER_ADDRESSES if self.common.core_timer else ()
+        return (*timer, *(reg.ain(n) for numbers in self.inputs.values() for n in numbers))
+
+    @property
+    def packet_size(self) -> int:
+        """Number of samples per packet."""
+        n_columns = len(self.scan_list)
+        scans = max(1, min(MAX_SAMPLES // n_columns, round(self.rate / PACKETS_PER_SECOND)))
+        return self.common.samples_per_packet or scans * n_columns
+
+    def patience(self, product: str) -> float:
+        """Return the time for which the device's buffer holds unsent samples, in s."""
+        if self.common.patience is not None:
+            return self.common.patience
+        n_samples = (self.common.buffer_bytes or BUFFERS[product]) / 2
+        return max(interface.DEFAULT_PATIENCE, n_samples / len(self.scan_list) / self.rate)
 
 
-def plan(settings: LabJackSettings, inputs: dict[str, tuple[int, ...]], rate: float) -> StreamPlan:
-    """Plan the stream of all sensors' inputs."""
-    timer = labjack.TIMER_ADDRESSES if settings.core_timer else ()
-    scan_list = (*timer, *(reg.ain(n) for numbers in inputs.values() for n in numbers))
-    if len(scan_list) > 128:
-        expected = f"{len(scan_list)} addresses to scan; expected at most 128"
-        raise BenchFileError(FileFault("sensors", expected))
-    n_columns = len(scan_list)
-    scans = max(1, min(MAX_SAMPLES // n_columns, round(rate / PACKETS_PER_SECOND)))
-    return StreamPlan(scan_list, rate, settings.samples_per_packet or scans * n_columns)
-
-
-def patience_of(settings: LabJackSettings, stream: StreamPlan, product: str) -> float:
-    """Return the time for which the device's buffer holds unsent samples, in s."""
-    if settings.patience is not None:
-        return settings.patience
-    n_samples = (settings.buffer_bytes or BUFFERS[product]) / 2
-    return max(interface.DEFAULT_PATIENCE, n_samples / len(stream.scan_list) / stream.rate)
-
-
-async def set_stream(
-    registers: Registers, settings: LabJackSettings, stream: StreamPlan, product: str
-) -> float:
+async def set_stream(registers: Registers, plan: Plan, product: str) -> float:
     """Configure the stream; return the actual scan rate, in Hz."""
+    settings, scan_list = plan.common, plan.scan_list
     command_response = settings.mode == "command-response"
     target = reg.TARGET_COMMAND_RESPONSE if command_response else reg.TARGET_ETHERNET
     divisor = settings.external_clock_divisor
     await registers.do(
         "setting up the stream",
-        real(reg.STREAM_SCANRATE_HZ, stream.rate),
-        long(reg.STREAM_NUM_ADDRESSES, len(stream.scan_list)),
-        long(reg.STREAM_SAMPLES_PER_PACKET, stream.packet_size),
+        real(reg.STREAM_SCANRATE_HZ, plan.rate),
+        long(reg.STREAM_NUM_ADDRESSES, len(scan_list)),
+        long(reg.STREAM_SAMPLES_PER_PACKET, plan.packet_size),
         real(reg.STREAM_SETTLING_US, settings.settling_us),
         long(reg.STREAM_RESOLUTION_INDEX, settings.resolution_index),
         long(reg.STREAM_BUFFER_SIZE_BYTES, settings.buffer_bytes or BUFFERS[product]),
@@ -392,8 +404,8 @@ async def set_stream(
         long(reg.STREAM_EXTERNAL_CLOCK_DIVISOR, divisor or 1),
         long(reg.STREAM_TRIGGER_INDEX, settings.trigger_index),
     )
-    for start in range(0, len(stream.scan_list), 32):
-        values = b"".join(a.to_bytes(4, "big") for a in stream.scan_list[start : start + 32])
+    for start in range(0, len(scan_list), 32):
+        values = b"".join(a.to_bytes(4, "big") for a in scan_list[start : start + 32])
         await registers.do(
             "setting the scan list", WriteAt(reg.STREAM_SCANLIST + 2 * start, values)
         )
@@ -411,29 +423,13 @@ async def read_calibrations(
     registers: Registers, numbers: tuple[int, ...], settings: LabJackSettings, product: str
 ) -> tuple[RangeCalibration, ...]:
     """Return the calibration of each of a sensor's inputs in their range, from the flash."""
+    range_ = range_of(settings, product)
     if product == "T7":
-        flash = await registers.do(
-            "reading the calibration",
-            long(reg.FLASH_READ_POINTER, reg.CALIBRATION_ADDRESS),
-            ReadAt(reg.FLASH_READ, 2 * reg.N_CALIBRATION_VALUES),
-        )
-        gain = RANGES[product].index(range_of(settings, product))
+        flash = await registers.flash(reg.CALIBRATION_ADDRESS, 2 * reg.N_CALIBRATION_VALUES)
+        gain = RANGES[product].index(range_)
         return (reg.decode_calibrations(flash)[gain],) * len(numbers)
-    return tuple(
-        [
-            reg.decode_calibration(
-                await registers.do(
-                    "reading the calibration",
-                    long(
-                        reg.FLASH_READ_POINTER,
-                        reg.t8_calibration_address(number, range_of(settings, product)),
-                    ),
-                    ReadAt(reg.FLASH_READ, 8),
-                )
-            )
-            for number in numbers
-        ]
-    )
+    addresses = [reg.t8_calibration_address(number, range_) for number in numbers]
+    return tuple([reg.decode_calibration(await registers.flash(at, 8)) for at in addresses])
 
 
 def details_of(
@@ -583,7 +579,7 @@ class LabJackDriver(interface.Driver[LabJackSettings]):
     states_temperature = True
     dtype = np.uint16
 
-    def check(self, sensors: Sequence[Sensor]) -> _Planned:
+    def check(self, sensors: Sequence[Sensor]) -> Plan:
         """Return the plan of the device; raise BenchFileError if it lacks a setting."""
         first, settings = sensors[0], self.typed(sensors)
         inputs = inputs_of(sensors, settings)
@@ -592,10 +588,12 @@ class LabJackDriver(interface.Driver[LabJackSettings]):
             fault = product and lacking(settings[sensor.name], inputs[sensor.name], product)
             if fault:
                 raise BenchFileError(replace(fault, sensor=sensor.name))
-        stream = plan(settings[first.name], inputs, first.sampling_rate)
-        return _Planned(
-            settings, inputs, stream, port_rules.host_of(first, "modbus-tcp", bare=True)
-        )
+        address = port_rules.host_of(first, "modbus-tcp", bare=True)
+        plan = Plan(settings, inputs, first.sampling_rate, address)
+        if (n_addresses := len(plan.scan_list)) > 128:
+            expected = f"{n_addresses} addresses to scan; expected at most 128"
+            raise BenchFileError(FileFault("sensors", expected))
+        return plan
 
     def open(
         self, sensors: Sequence[Sensor], clock: HostClock
@@ -611,24 +609,12 @@ class LabJackDriver(interface.Driver[LabJackSettings]):
         return _opened(self.check(sensors), sensors, clock, last)
 
 
-@dataclass(frozen=True, slots=True)
-class _Planned:
-    """Settings of one device in the bench file."""
-
-    settings: dict[str, LabJackSettings]
-    inputs: dict[str, tuple[int, ...]]
-    stream: StreamPlan
-    address: tuple[str, int]
-
-
 @contextlib.asynccontextmanager
 async def _opened(
-    planned: _Planned, sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
+    plan: Plan, sensors: Sequence[Sensor], clock: HostClock, before: LabJackSession | None
 ) -> AsyncIterator[LabJackSession]:
-    settings, inputs, stream_plan = planned.settings, planned.inputs, planned.stream
-    common, (host, number) = settings[sensors[0].name], planned.address
-    address = f"socket://{host}:{number}"
-    async with open_port(address, clock, label=port_label(sensors)) as stream:
+    settings, inputs, (host, number) = plan.settings, plan.inputs, plan.address
+    async with open_port(f"socket://{host}:{number}", clock, label=port_label(sensors)) as stream:
         registers = Registers(stream)
         product, identity = await identify(registers, sensors)
         uptime = await read_uptime(registers)
@@ -636,25 +622,16 @@ async def _opened(
         try:
             for name, numbers in inputs.items():
                 await set_inputs(registers, numbers, settings[name], product)
-            rate = await set_stream(registers, common, stream_plan, product)
-            calibrations = {
-                name: await read_calibrations(registers, numbers, settings[name], product)
-                for name, numbers in inputs.items()
-            }
-            information = tuple(
-                replace(
-                    identity,
-                    sensor=name,
-                    sampling_rate=rate,
-                    details=details_of(
-                        range_of(settings[name], product), numbers, calibrations[name]
-                    ),
-                )
-                for name, numbers in inputs.items()
-            )
+            identity = replace(identity, sampling_rate=await set_stream(registers, plan, product))
+            found = []
+            for name, numbers in inputs.items():
+                own = await read_calibrations(registers, numbers, settings[name], product)
+                details = details_of(range_of(settings[name], product), numbers, own)
+                found.append(replace(identity, sensor=name, details=details))
+            information, rate = tuple(found), identity.sampling_rate or plan.rate
             decoder = StreamDecoder(
                 {name: [reg.ain(n) for n in numbers] for name, numbers in inputs.items()},
-                scan_list=stream_plan.scan_list,
+                scan_list=plan.scan_list,
                 scan_rate=rate,
             )
             resumed = before is not None and _continues(before, uptime, information)
@@ -663,13 +640,13 @@ async def _opened(
                 decoder.restart()
             yield LabJackSession(
                 registers,
-                common,
+                plan.common,
                 decoder,
                 information=information,
                 clock=clock,
-                stream_address=f"socket://{host}:{common.stream_port}",
-                packet_seconds=stream_plan.packet_size / len(stream_plan.scan_list) / rate,
-                patience=patience_of(common, stream_plan, product),
+                stream_address=f"socket://{host}:{plan.common.stream_port}",
+                packet_seconds=plan.packet_size / len(plan.scan_list) / rate,
+                patience=plan.patience(product),
                 uptime=uptime,
                 resumed=resumed,
             )
@@ -682,11 +659,10 @@ def _continues(
     before: LabJackSession, uptime: Uptime | None, now: tuple[interface.DeviceInformation, ...]
 ) -> bool:
     """Return whether the device and its rate are the same, and it was not restarted."""
-    then = before.information
-    is_same = [(i.serial_number, i.sampling_rate) for i in then] == [
-        (i.serial_number, i.sampling_rate) for i in now
-    ]
-    if not is_same or before.uptime is None or uptime is None:
+    then, after = (
+        [(i.serial_number, i.sampling_rate) for i in some] for some in (before.information, now)
+    )
+    if then != after or before.uptime is None or uptime is None:
         return False
     return before.decoder.can_resume and before.uptime.continues_to(uptime)
 
