@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.devices.text.driver import TextDriver
@@ -22,6 +21,7 @@ from sim_devices.server.launch import RunningDevice
 from sim_devices.world.world import World
 from tests.daq.devices import reading
 from tests.devices import serving
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, scenario, sensors, spec
 
 pytestmark = pytest.mark.devices
@@ -85,30 +85,6 @@ async def record(one: Sensor, n_samples: int) -> tuple[list[Block], list[Event]]
     return await reading.record(DRIVER, one, n_samples, speed=SPEED)
 
 
-async def test_another_device_on_the_same_port_is_ignored(
-    running: tuple[RunningDevice, ...],
-) -> None:
-    one = sensor(running, 0)
-    counts: list[int] = []
-    said = ""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        try:
-            other.bind(("127.0.0.2", 0))
-        except OSError:
-            pytest.skip("this system has one loopback address only")
-        async with reading.reading(DRIVER, [one], speed=SPEED) as items:
-            async for item in items:
-                if isinstance(item, Event):
-                    said = item.text
-                    break
-                counts += item.counts[:, 0].tolist() if isinstance(item, Block) else []
-                where = host_and_port(one.port)
-                other.sendto(b"{'EHZ', 1582315130.292, 777777777, 777777777}", where)
-    assert said == "datagrams from 127.0.0.2 are ignored: another device sends to this port"
-    assert counts
-    assert 777777777 not in counts
-
-
 async def test_a_stray_byte_does_not_take_the_port() -> None:
     """The first packet comes from another host, and is none of the device's."""
     one, packet = own_port(), b"{'EHZ', 1582315130.292, 7, 8}"
@@ -156,14 +132,8 @@ def own_port(**settings: object) -> Sensor:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         number = free.getsockname()[1]
-    return Sensor(
-        name="S",
-        driver="text",
-        port=f"udp://0.0.0.0:{number}",
-        sampling_rate=10.0,
-        channels=(Channel(name="EHZ", sensitivity=1.0),),
-        settings={"preset": "raspberry-shake", **settings},
-    )
+    port, own = f"udp://0.0.0.0:{number}", {"preset": "raspberry-shake", **settings}
+    return sensor_at(port, "text", "S", rate=10.0, channels=["EHZ"], settings=own)
 
 
 @contextlib.contextmanager
