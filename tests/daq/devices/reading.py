@@ -55,15 +55,23 @@ async def record(
     driver: AnyDriver, sensor: Sensor, n_samples: int, *, speed: float = 1.0
 ) -> tuple[list[Block], list[Event]]:
     """Return the blocks of one sensor up to a sample, and the events until then."""
-    blocks: list[Block] = []
+    blocks, events = await record_all(driver, [sensor], n_samples, speed=speed)
+    return blocks[sensor.name], events
+
+
+async def record_all(
+    driver: AnyDriver, sensors: Sequence[Sensor], n_samples: int, *, speed: float = 1.0
+) -> tuple[dict[str, list[Block]], list[Event]]:
+    """Return the blocks of all sensors of a port up to a sample, and the events until then."""
+    blocks: dict[str, list[Block]] = {sensor.name: [] for sensor in sensors}
     events: list[Event] = []
-    async with reading(driver, [sensor], speed=speed) as items:
+    async with reading(driver, sensors, speed=speed) as items:
         async for item in items:
             if isinstance(item, Event):
                 events.append(item)
             if not isinstance(item, Block):
                 continue
-            blocks.append(item)
-            if item.end_sample >= n_samples:
+            blocks[item.sensor].append(item)
+            if all(each and each[-1].end_sample >= n_samples for each in blocks.values()):
                 break
     return blocks, events

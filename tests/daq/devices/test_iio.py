@@ -126,16 +126,6 @@ def test_lost_scans_are_gaps_where_the_times_have_them(jitter: float) -> None:
     assert BlockFlag.CLOCK_RESTART in blocks[0].flags
 
 
-@pytest.mark.parametrize("step", [-5000, 5000])
-def test_a_clock_that_is_set_makes_no_gap(step: int) -> None:
-    """Back, or forward by more than has passed on the host: nothing was lost meanwhile."""
-    after = [8 + step, 9 + step, 10 + step], [11 + step, 12 + step]
-    found = decoded([0, 1, 2, 3], [4, 5, 6], *after, arrivals=[3, 6, 10, 12])
-    blocks = [item for item in found if isinstance(item, Block)]
-    assert [(b.first_sample, b.end_sample) for b in blocks] == [(0, 4), (4, 7), (7, 10), (10, 12)]
-    assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]
-
-
 @pytest.mark.parametrize("step", [-3600.0, -0.3, -0.02, 0.02, 0.3, 3600.0])
 def test_scans_of_a_clock_that_is_set_are_all_kept(step: float) -> None:
     """Buffers of 0.2 s, which arrive 0.5 ms late on average."""

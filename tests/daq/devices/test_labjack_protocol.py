@@ -370,21 +370,6 @@ def test_a_packet_with_lost_bytes_does_not_shift_later_ones(timed: bool) -> None
     assert starts == [0, 10, 20, 30, 40, 50, *range(70, 200, 10)]  # the next one pays for it
 
 
-def test_a_late_repeated_packet_is_recognised_by_its_timer() -> None:
-    """Host time alone cannot tell it from a restart when the host was held up."""
-    scan_list = [*stream.TIMER_ADDRESSES, 0]
-    decoder = stream.StreamDecoder({"L": [0]}, scan_list=scan_list, scan_rate=200.0)
-    blocks: list[Block] = []
-    for number, seconds in ((0, 0.1), (1, 0.2), (1, 3.0), (1, 3.0), (2, 3.1)):
-        timer = (np.arange(20) + 20 * number) * 200_000
-        rows = np.column_stack([timer & 0xFFFF, timer >> 16, np.full(20, number)])
-        packet = Packet(rows.astype(np.uint16).ravel(), transaction=number)
-        at = HostTime(round(seconds * 1e9), 0)
-        found = decoder.receive(encode_packet(packet), at)
-        blocks += [item for item in found if isinstance(item, Block)]
-    assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 20), (20, 20), (40, 20)]
-
-
 @pytest.mark.parametrize("jitter", [1, 4000])
 def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
     """Ticks of 25 ns, over more than two wraps: what was long ago is not what was just now."""
