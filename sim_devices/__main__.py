@@ -19,13 +19,8 @@ def main(arguments: list[str]) -> int:
         spec = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
         with start(spec) as running:
             for device in running:
-                entry = {
-                    "sensors": device.sensors,
-                    "driver": device.driver,
-                    "port": device.port,
-                    "settings": device.settings,
-                }
-                print(json.dumps(entry), flush=True)
+                keys = ("sensors", "driver", "port", "settings")
+                print(json.dumps({key: getattr(device, key) for key in keys}), flush=True)
             sys.stdin.read()
     except KeyboardInterrupt:
         return 130

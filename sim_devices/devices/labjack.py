@@ -399,21 +399,12 @@ class LabJack:
         overlap = rate * n_columns > MAX_SAMPLE_RATE
         as_is = overlap or rate == self._source.sampling_rate
         source = self._source if as_is else self._source.at_rate(rate)
-        columns = InputColumns(
-            addresses,
-            self._inputs,
-            rate,
-            core_began=self._core_began,
-            system_began=self._system_began or 0.0,
-        )
+        began = self._core_began, self._system_began or 0.0
+        columns = InputColumns(addresses, self._inputs, rate, *began)
         capacity = (self._value(reg.STREAM_BUFFER_SIZE_BYTES) or 4096) // 2
-        stream = Stream(
-            Samples(source, self._sensors),
-            columns,
-            capacity=capacity,
-            packet_size=self.packet_size if self.targets & reg.TARGET_ETHERNET else 1,
-            now=now,
-        )
+        size = self.packet_size if self.targets & reg.TARGET_ETHERNET else 1
+        samples = Samples(source, self._sensors)
+        stream = Stream(samples, columns, capacity=capacity, packet_size=size, now=now)
         stream.wanted = self._value(reg.STREAM_NUM_SCANS) or None
         if overlap:
             stream.breaks_off = (1, SCAN_OVERLAP)

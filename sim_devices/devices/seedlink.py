@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from fractions import Fraction
 from pathlib import Path
 
@@ -112,15 +113,10 @@ class SimulatedStation:
         first = record * RECORD_SAMPLES
         counts = whole(self._samples.counts(first, RECORD_SAMPLES), -(1 << 31), (1 << 31) - 1)
         start_ns = self._utc_ns + round(self._samples.time(first) * _NS)
-        made = WaveRecord(
-            self.network,
-            self.station,
-            self._location,
-            self.channels[column],
-            self._source.stated_ns(self._sensor, start_ns // 1000 * 1000),
-            Fraction(self._rate).limit_denominator(1000),
-            counts[:, column].astype(np.int32),
-        )
+        codes = self.network, self.station, self._location, self.channels[column]
+        stated_ns = self._source.stated_ns(self._sensor, start_ns // 1000 * 1000)
+        rate = Fraction(self._rate).limit_denominator(1000)
+        made = WaveRecord(*codes, stated_ns, rate, counts[:, column].astype(np.int32))
         (payload,) = encode_record(made)
         sequence = index - self.began * self.n_channels + self._first_sequence
         return Packet(sequence, payload, f"{self.network}_{self.station}")
@@ -130,16 +126,9 @@ class SimulatedStation:
         code = self.channels[index % self.n_channels]
         wanted = [selector.replace("_", "") for selector in selectors]
         return not wanted or any(
-            _alike(code, one[-3:]) and _alike(self._location, one[:-3] or "*") for one in wanted
+            fnmatchcase(code, one[-3:]) and fnmatchcase(self._location, one[:-3] or "*")
+            for one in wanted
         )
-
-
-def _alike(code: str, pattern: str) -> bool:
-    if pattern == "*":
-        return True
-    return len(code) == len(pattern) and all(
-        p in {"?", c} for c, p in zip(code, pattern, strict=True)
-    )
 
 
 class SeedLinkServer(Endpoint):

@@ -107,14 +107,7 @@ class DeviceServer:
             (Path(folder) / "simulated-ports.json").write_text(json.dumps(ports), encoding="utf-8")
             try:
                 yield tuple(
-                    RunningDevice(
-                        sensors=tuple(device["sensors"]),
-                        driver=device["driver"],
-                        port=device["port"],
-                        settings=device["settings"],
-                        pid=device["pid"],
-                        clock=path,
-                    )
+                    RunningDevice(**{**device, "sensors": tuple(device["sensors"])}, clock=path)
                     for device in answer["devices"]
                 )
             finally:

@@ -435,14 +435,9 @@ def self_signed(folder: Path) -> tuple[ssl.SSLContext, str]:
         .sign(key, hashes.SHA256())
     )
     public, private = folder / "certificate.pem", folder / "key.pem"
-    public.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    private.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
-        )
-    )
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    public.write_bytes(certificate.public_bytes(pem))
+    private.write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(public, private)
     return context, str(public)
@@ -693,21 +688,13 @@ async def serve(
 
     tell_sent.write(at=clock.now(), utc_ns=device.utc_ns)
     first_port = int(spec["devices"][index].get("number", 0))
-    served = [
-        Served(
-            line,
-            clock,
-            LineFaults(
-                [f for f in faults if line.carries_samples or f.kind == "disconnect"],
-                f"{name} {k}",
-                begin=clock.now(),
-            ),
-            tell,
-            sent if line.carries_samples and tell_sent.is_wanted else None,
-            number=int(device.settings.get(line.setting, 0)) if k and first_port else first_port,
-        )
-        for k, line in enumerate(lines)
-    ]
+    served = []
+    for k, line in enumerate(lines):
+        own = [f for f in faults if line.carries_samples or f.kind == "disconnect"]
+        of_line = LineFaults(own, f"{name} {k}", begin=clock.now())
+        told = sent if line.carries_samples and tell_sent.is_wanted else None
+        port = int(device.settings.get(line.setting, 0)) if k and first_port else first_port
+        served.append(Served(line, clock, of_line, tell, told, port))
     opened: list[Served] = []
     try:
         for one in served:
@@ -753,17 +740,11 @@ def _announcement(device: interface.DeviceSpec, served: Sequence[Served]) -> dic
 
 def device_spec(table: Mapping[str, Any]) -> interface.DeviceSpec:
     """Parse one entry of ``devices``."""
-    return interface.DeviceSpec(
-        sensors=tuple(table["sensors"]),
-        driver=table["driver"],
-        port=table.get("port", "pty"),
-        sampling_rate=float(table["sampling_rate"]),
-        channels={
-            sensor: tuple(interface.ChannelSpec(**channel) for channel in channels)
-            for sensor, channels in table["channels"].items()
-        },
-        settings=table.get("settings", {}),
-        sensor_settings=table.get("sensor_settings", {}),
-        model=table.get("model", ""),
-        serial_number=table.get("serial_number", ""),
-    )
+    given: dict[str, Any] = {"port": "pty", **table}
+    given.pop("number", None)
+    given["sensors"] = tuple(table["sensors"])
+    given["channels"] = {
+        sensor: tuple(interface.ChannelSpec(**channel) for channel in channels)
+        for sensor, channels in table["channels"].items()
+    }
+    return interface.DeviceSpec(**given)

@@ -7,6 +7,7 @@ with 1.5 times the PSD along y as along x.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,14 @@ CASES: Mapping[str, tuple[str, tuple[str, str, str]]] = {
 """Table 1: set-up and sensors of each case, with the target first."""
 
 
+def _sensor(
+    rotation: float | tuple[float, float, float],
+    noise: Spectrum = White(level=NOISE),  # noqa: B008 -- frozen
+    **more: Any,  # noqa: ANN401 -- whatever a table holds
+) -> SensorModel:
+    return SensorModel(sampling_rate=SAMPLING_RATE, rotation=rotation, noise=noise, **more)
+
+
 def _white_motion(along_x: float, ratio: float = 1.5) -> CommonMotion:
     return CommonMotion(spectra=(White(level=along_x), White(level=ratio * along_x)))
 
@@ -50,18 +59,9 @@ def three_channels(
     """
     cosine, sine = np.cos(np.radians(turned[0])), np.sin(np.radians(turned[0]))
     along_x = snr * NOISE / float(cosine**2 + ratio * sine**2)
-    return Scenario(
-        motion=_white_motion(along_x, ratio),
-        sensors={
-            name: SensorModel(
-                sampling_rate=SAMPLING_RATE,
-                directions=((1.0, 0.0),),
-                rotation=angle,
-                noise=White(level=NOISE),
-            )
-            for name, angle in zip("ijk", turned, strict=True)
-        },
-    )
+    each = [_sensor(angle, directions=((1.0, 0.0),)) for angle in turned]
+    sensors = dict(zip("ijk", each, strict=True))
+    return Scenario(motion=_white_motion(along_x, ratio), sensors=sensors)
 
 
 def biaxial(*, theta: float, channel_angles: tuple[float, float, float], snr: float) -> Scenario:
@@ -70,21 +70,11 @@ def biaxial(*, theta: float, channel_angles: tuple[float, float, float], snr: fl
     `channel_angles` are the angles between the channels of each sensor in degrees. Channel 1 of
     sensor i points along x; `snr` is that of this channel.
     """
-    return Scenario(
-        motion=_white_motion(snr * NOISE),
-        sensors={
-            name: SensorModel(
-                sampling_rate=SAMPLING_RATE,
-                directions=(
-                    (1.0, 0.0),
-                    (float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle)))),
-                ),
-                rotation=turned,
-                noise=White(level=NOISE),
-            )
-            for name, turned, angle in zip("ijk", (0.0, theta, theta), channel_angles, strict=True)
-        },
-    )
+    sensors = {}
+    for name, turned, angle in zip("ijk", (0.0, theta, theta), channel_angles, strict=True):
+        second = float(np.cos(np.radians(angle))), float(np.sin(np.radians(angle)))
+        sensors[name] = _sensor(turned, directions=((1.0, 0.0), second))
+    return Scenario(motion=_white_motion(snr * NOISE), sensors=sensors)
 
 
 def fig4(*, theta: float = 10.0, snr: float = 100.0, ratio: float = 1.5) -> Scenario:
@@ -154,19 +144,12 @@ def laboratory(turned: Mapping[str, float], *, seed: int = 0) -> Scenario:
     At 600 m/s waves do little to equilateral triangles and much to wider ones, as in Figs. 10
     and 14.
     """
-    return Scenario(
-        seed=seed,
-        motion=PlaneWaves(spectrum=LABORATORY, speed=600.0),
-        sensors={
-            name: SensorModel(
-                sampling_rate=SAMPLING_RATE,
-                rotation=turned[name],
-                noise=SERVO_NOISE,
-                position=position,
-            )
-            for name, position in hexagon().items()
-        },
-    )
+    sensors = {
+        name: _sensor(turned[name], SERVO_NOISE, position=position)
+        for name, position in hexagon().items()
+    }
+    motion = PlaneWaves(spectrum=LABORATORY, speed=600.0)
+    return Scenario(seed=seed, motion=motion, sensors=sensors)
 
 
 def setup1(*, seed: int = 0) -> Scenario:
@@ -186,19 +169,12 @@ def waves(*, snr: float = 1e3, speed: float = 150.0, seed: int = 0) -> Scenario:
     times the noise from 20 Hz on.
     """
     angles = np.random.default_rng(9).uniform(-180.0, 180.0, (5, 3))
-    return Scenario(
-        seed=seed,
-        motion=PlaneWaves(spectrum=White(level=snr * NOISE), speed=speed),
-        sensors={
-            name: SensorModel(
-                sampling_rate=SAMPLING_RATE,
-                rotation=(float(yaw), float(pitch), float(roll)),
-                noise=White(level=NOISE),
-                position=position,
-            )
-            for (name, position), (yaw, pitch, roll) in zip(hexagon().items(), angles, strict=True)
-        },
-    )
+    sensors = {
+        name: _sensor(tuple(turned), position=position)
+        for (name, position), turned in zip(hexagon().items(), angles.tolist(), strict=True)
+    }
+    motion = PlaneWaves(spectrum=White(level=snr * NOISE), speed=speed)
+    return Scenario(seed=seed, motion=motion, sensors=sensors)
 
 
 def two(*, snr: float = 30.0, deviation: float = 6.0, seed: int = 0) -> Scenario:
@@ -207,36 +183,15 @@ def two(*, snr: float = 30.0, deviation: float = 6.0, seed: int = 0) -> Scenario
     With `deviation` in dB. The noise of both follows from the changes, without a third sensor.
     """
     angles = np.random.default_rng(27).uniform(-180.0, 180.0, (2, 3))
-    return Scenario(
-        seed=seed,
-        motion=CommonMotion(
-            spectra=tuple(White(level=each * snr * NOISE) for each in (1.0, 1.5, 0.8)),
-            level=ChangingLevel(deviation=deviation),
-        ),
-        sensors={
-            name: SensorModel(
-                sampling_rate=SAMPLING_RATE,
-                rotation=(float(yaw), float(pitch), float(roll)),
-                gain=gain,
-                noise=White(level=noise * NOISE),
-            )
-            for name, gain, noise, (yaw, pitch, roll) in zip(
-                "AB", (1.0, 1.1), (1.0, 0.5), angles, strict=True
-            )
-        },
-    )
+    first, second = map(tuple, angles.tolist())
+    sensors = {"A": _sensor(first), "B": _sensor(second, White(level=0.5 * NOISE), gain=1.1)}
+    spectra = tuple(White(level=each * snr * NOISE) for each in (1.0, 1.5, 0.8))
+    motion = CommonMotion(spectra=spectra, level=ChangingLevel(deviation=deviation))
+    return Scenario(seed=seed, motion=motion, sensors=sensors)
 
 
 SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
-    "fig4": fig4,
-    "fig5": fig5,
-    "fig9": fig9,
-    "fig12": fig12,
-    "fig13": fig13,
-    "setup1": setup1,
-    "setup2": setup2,
-    "waves": waves,
-    "two": two,
+    each.__name__: each for each in (fig4, fig5, fig9, fig12, fig13, setup1, setup2, waves, two)
 }
 
 
