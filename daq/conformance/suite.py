@@ -387,12 +387,16 @@ class DriverConformance:
         return found
 
 
+def _blocks_of(sensor: Sensor, found: Sequence[DeviceItem]) -> list[Block]:
+    return [one for one in found if isinstance(one, Block) and one.sensor == sensor.name]
+
+
 def check_blocks(driver: AnyDriver, sensors: Sequence[Sensor], found: Sequence[DeviceItem]) -> None:
     """See that the blocks of a session follow one another, and that nothing was wrong."""
     wrong = [item for item in found if isinstance(item, Event) and item.kind not in NORMAL_EVENTS]
     assert not wrong
     for sensor in sensors:
-        blocks = [b for b in found if isinstance(b, Block) and b.sensor == sensor.name]
+        blocks = _blocks_of(sensor, found)
         assert blocks, f"no block of {sensor.name}"
         assert blocks[0].first_sample == 0
         assert BlockFlag.CLOCK_RESTART in blocks[0].flags, "the sampling clock begins here"
@@ -423,13 +427,7 @@ def check_counters(sensors: Sequence[Sensor], found: Sequence[DeviceItem]) -> No
     of its values is rounded by up to half of ``_TIME_STEP``, however few samples a block has.
     """
     for sensor in sensors:
-        blocks = [
-            one
-            for one in found
-            if isinstance(one, Block)
-            and one.sensor == sensor.name
-            and one.device_counter is not None
-        ]
+        blocks = [b for b in _blocks_of(sensor, found) if b.device_counter is not None]
         counters = np.array([block.device_counter for block in blocks], np.int64)
         index = np.array([block.first_sample for block in blocks], np.int64)
         assert np.all(np.diff(counters) > 0), f"device_counter of {sensor.name} does not grow"
@@ -478,8 +476,7 @@ def check_truth(
     int
         The number of samples sent up to the last row.
     """
-    name = sensor.name
-    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    name, blocks = sensor.name, _blocks_of(sensor, found)
     index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
     counts = np.concatenate([block.counts for block in blocks])
     starts = np.flatnonzero(_same(sent.counts, counts[0]))
@@ -516,8 +513,7 @@ def check_truth(
 
 def check_restart(sensor: Sensor, found: Sequence[DeviceItem], sent: Sent) -> None:
     """See that a session has one restart of the device, and that rows on both sides are right."""
-    name, rate = sensor.name, sensor.sampling_rate
-    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    name, rate, blocks = sensor.name, sensor.sampling_rate, _blocks_of(sensor, found)
     anew = [k for k, b in enumerate(blocks) if BlockFlag.CLOCK_RESTART in b.flags]
     assert len(anew) == 2, f"{name}: {len(anew)} blocks with CLOCK_RESTART; expected 2"
     before, after = blocks[: anew[1]], blocks[anew[1] :]
