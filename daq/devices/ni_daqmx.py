@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -193,14 +194,10 @@ class NiDriver(Driver[NiSettings]):
             with _errors(label):
                 task.start()
 
+        stop = partial(_quietly, task.stop)
         try:
             yield BlockingSource(
-                sensors,
-                clock,
-                start=start,
-                read=read,
-                stop=lambda: _quietly(task.stop),
-                information=information,
+                sensors, clock, start=start, read=read, stop=stop, information=information
             )
         finally:
             await asyncio.to_thread(_quietly, task.close)
@@ -237,16 +234,10 @@ def _opened(
         task.in_stream.overwrite = constants.OverwriteMode.OVERWRITE_UNREAD_SAMPLES
         actual, information = float(task.timing.samp_clk_rate), []
         for sensor, one in inputs.items():
-            device = Device(one.device)
-            information.append(
-                DeviceInformation(
-                    sensor,
-                    model=device.product_type,
-                    serial_number=f"{device.serial_num:X}",  # as on its label
-                    sampling_rate=actual,
-                    details={"inputs": ", ".join(one.names)},
-                )
-            )
+            device, details = Device(one.device), {"inputs": ", ".join(one.names)}
+            model, serial = device.product_type, f"{device.serial_num:X}"  # as on its label
+            about = DeviceInformation(sensor, model, serial, sampling_rate=actual, details=details)
+            information.append(about)
     except BaseException:
         _quietly(task.close)
         raise

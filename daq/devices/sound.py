@@ -148,14 +148,11 @@ class SoundDriver(Driver[SoundSettings]):
     def ports(self) -> list[PresentPort]:
         """See :class:`daq.devices.interface.Listing`."""
         with _portaudio("sound cards") as library:
-            return [
-                PresentPort(
-                    f"{SCHEME}{card['name']}",
-                    f"{card['max_input_channels']} inputs, {card['default_samplerate']:g} Hz",
-                )
-                for card in library.query_devices()
-                if card["max_input_channels"] > 0
-            ]
+            found = []
+            for card in _cards(library):
+                about = f"{card['max_input_channels']} inputs, {card['default_samplerate']:g} Hz"
+                found.append(PresentPort(f"{SCHEME}{card['name']}", about))
+            return found
 
     @contextlib.asynccontextmanager
     async def open(
@@ -199,22 +196,15 @@ class SoundDriver(Driver[SoundSettings]):
                     raise NotConnectedError(f"{label}: the sound card stopped; check its cable")
                 return found
 
+            model, rate, information = card["name"], float(stream.samplerate), []
+            for name, some in inputs.items():
+                details = {"inputs": ", ".join(map(str, some))}
+                one = DeviceInformation(name, model=model, sampling_rate=rate, details=details)
+                information.append(one)
+            start, stop = stream.start, stream.stop  # to abort would cancel a thread with Python
             try:
                 yield BlockingSource(
-                    sensors,
-                    clock,
-                    start=stream.start,
-                    read=read,
-                    stop=stream.stop,  # to abort would cancel a thread that runs Python
-                    information=[
-                        DeviceInformation(
-                            name,
-                            model=card["name"],
-                            sampling_rate=float(stream.samplerate),
-                            details={"inputs": ", ".join(map(str, some))},
-                        )
-                        for name, some in inputs.items()
-                    ],
+                    sensors, clock, start=start, read=read, stop=stop, information=information
                 )
             finally:
                 await asyncio.to_thread(_close, stream)
@@ -249,9 +239,14 @@ def _portaudio(label: str) -> Any:  # noqa: ANN401
             _n_open -= 1
 
 
+def _cards(library: Any) -> list[dict[str, Any]]:  # noqa: ANN401
+    """Return the cards with inputs."""
+    return [card for card in library.query_devices() if card["max_input_channels"] > 0]
+
+
 def _card(library: Any, wanted: str, n_inputs: int, label: str) -> dict[str, Any]:  # noqa: ANN401
     """Return the only card with a name; without a name, the system's default."""
-    cards = [card for card in library.query_devices() if card["max_input_channels"] > 0]
+    cards = _cards(library)
     names = ", ".join(repr(card["name"]) for card in cards) or "none"
     if not wanted:
         index = library.default.device[0]
@@ -267,8 +262,7 @@ def _card(library: Any, wanted: str, n_inputs: int, label: str) -> dict[str, Any
             f"{label}: {found[0]['name']!r} has {found[0]['max_input_channels']} inputs; expected"
             f" at least {n_inputs}"
         )
-    card: dict[str, Any] = found[0]
-    return card
+    return found[0]
 
 
 DRIVER = SoundDriver()

@@ -462,12 +462,5 @@ class JoinedStreams:
         if full_scale and (counts.max() >= full_scale or counts.min() <= -full_scale):
             flags |= BlockFlag.CLIPPED
         self._taken_to = end
-        return Block(
-            self._name,
-            start,
-            counts,
-            at,
-            device_counter=pieces[0].start_ns,
-            flags=flags,
-            reason=reason if missing else "",
-        )
+        reason = reason if missing else ""
+        return Block(self._name, start, counts, at, pieces[0].start_ns, flags, reason)

@@ -504,10 +504,5 @@ class BlockWriter:
     def _append_gap(self, name: str, gap: Gap) -> None:
         sensor = self._sensors[name]
         sensor.unsafe.add(gap)
-        self._writer.gap(
-            name,
-            gap.first_sample - sensor.base,
-            gap.missing,
-            reason=gap.reason,
-            estimated=gap.estimated,
-        )
+        first = gap.first_sample - sensor.base
+        self._writer.gap(name, first, gap.missing, reason=gap.reason, estimated=gap.estimated)

@@ -79,18 +79,12 @@ FLAG_ERROR = 0x0001
 RATES = {1000: 2, 500: 3, 200: 4, 100: 5, 50: 6}
 """Sampling rate in Hz → code in SMPL_CTRL's high byte."""
 BAUD_RATES = {460800: 1, 230400: 2, 115200: 3}
-FILTERS = {
-    "K64_FC83": 0x1,
-    "K64_FC220": 0x2,
-    "K128_FC36": 0x3,
-    "K128_FC110": 0x4,
-    "K128_FC350": 0x5,
-    "K512_FC9": 0x6,
-    "K512_FC16": 0x7,
-    "K512_FC60": 0x8,
-    "K512_FC210": 0x9,
-    "K512_FC460": 0xA,
-}
+_FILTERS = (
+    *("K64_FC83", "K64_FC220", "K128_FC36", "K128_FC110", "K128_FC350"),
+    *("K512_FC9", "K512_FC16", "K512_FC60", "K512_FC210", "K512_FC460"),
+)
+FILTERS = {name: code for code, name in enumerate(_FILTERS, 1)}
+"""Name → code in FILTER_CTRL."""
 NOT_ON_A370 = frozenset({"K64_FC220", "K128_FC350", "K512_FC460"})
 USUAL_FILTER = {
     1000: "K512_FC460",

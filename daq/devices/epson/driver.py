@@ -168,13 +168,10 @@ class Configuration:
 
     def decoder(self, sensor: str) -> BurstDecoder:
         """Return a decoder of the configured bursts."""
-        full_scale = self.settings.full_scale * commands.COUNTS_PER_G
+        rate, end = self.sampling_rate, round(self.settings.full_scale * commands.COUNTS_PER_G)
+        end = min(end, 2**31 - 1)
         return BurstDecoder(
-            sensor,
-            self.burst,
-            fields=self.fields,
-            sampling_rate=self.sampling_rate,
-            full_scale_counts=min(round(full_scale), 2**31 - 1),
+            sensor, self.burst, fields=self.fields, sampling_rate=rate, full_scale_counts=end
         )
 
     def writes(self) -> list[tuple[Register, bool, int]]:
@@ -216,9 +213,8 @@ class Device:
     """Access to the registers of one device in configuration mode."""
 
     def __init__(self, sensor: Sensor, stream: ByteStream) -> None:
-        self.stream = stream
+        self.stream = self._stream = stream
         self._sensor = sensor
-        self._stream = stream
 
     async def _send(self, payload: bytes) -> None:
         """Send commands of three bytes one by one, ``WRITE_INTERVAL`` apart."""

@@ -303,21 +303,12 @@ class IioDriver(interface.Driver[IioSettings]):
             if settings.trigger:
                 await iiod.ask(f"SETTRIG {device.id} {settings.trigger}")
             rate = await _set_rate(iiod, device, inputs[0], sensor, label)
+            details = {"device": device.id, "inputs": ", ".join(inputs)}
             information = interface.DeviceInformation(
-                sensor.name,
-                model=device.name,
-                sampling_rate=rate,
-                details={"device": device.id, "inputs": ", ".join(inputs)},
+                sensor.name, model=device.name, sampling_rate=rate, details=details
             )
             try:
-                yield IioSession(
-                    iiod,
-                    sensor,
-                    device,
-                    inputs,
-                    information=(information,),
-                    patience=settings.patience,
-                )
+                yield IioSession(iiod, sensor, device, inputs, (information,), settings.patience)
             finally:
                 with contextlib.suppress(Exception):
                     await stream.write(f"CLOSE {device.id}\r\nEXIT\r\n".encode())

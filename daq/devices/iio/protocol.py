@@ -58,16 +58,9 @@ class ScanElement:
         found = _FORMAT.fullmatch(text)
         if found is None or not 0 < int(found[3]) <= int(found[4]):
             raise RemoteProtocolError(f"channel {channel}: format {text[:40]!r} is not known")
-        return cls(
-            channel,
-            index,
-            found[1],
-            found[2] in "sS",
-            int(found[3]),
-            int(found[4]) // 8,
-            int(found[5] or 0),
-            tuple(attributes),
-        )
+        bits, size, shift = int(found[3]), int(found[4]) // 8, int(found[5] or 0)
+        is_signed = found[2] in "sS"
+        return cls(channel, index, found[1], is_signed, bits, size, shift, tuple(attributes))
 
 
 @dataclass(frozen=True, slots=True)

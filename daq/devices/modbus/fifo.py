@@ -153,37 +153,21 @@ class FifoDriver(interface.Driver[FifoSettings]):
     async def open(self, sensors: Sequence[Sensor], clock: HostClock) -> AsyncIterator[FifoSession]:
         """Open the port, test that the device replies, and set its sampling rate."""
         sensor, settings = self.check(sensors)
-        async with open_port(
-            sensor.port,
-            clock,
-            label=port_label(sensors),
-            baud_rate=settings.baud_rate,
-            parity=settings.parity,
-        ) as stream:
+        rate, n_channels, label = sensor.sampling_rate, len(sensor.channels), port_label(sensors)
+        line = settings.model_dump(include={"baud_rate", "parity"})
+        async with open_port(sensor.port, clock, label=label, **line) as stream:
             await _set_up(stream, sensor, settings)
-            decoder = FifoDecoder(
-                sensor.name,
-                sensor.sampling_rate,
-                n_channels=len(sensor.channels),
-                header=settings.header,
-                unit=settings.unit,
-                capacity=settings.capacity,
-            )
+            header, unit, capacity = settings.header, settings.unit, settings.capacity
+            decoder = FifoDecoder(sensor.name, rate, n_channels, header, unit, capacity)
             information = interface.DeviceInformation(
                 sensor=sensor.name,
                 model=sensor.model or "block FIFO",
-                sampling_rate=sensor.sampling_rate,
-                details={"unit": str(settings.unit), "header": settings.header},
+                sampling_rate=rate,
+                details={"unit": str(unit), "header": header},
             )
-            kept = (settings.capacity or 0) / len(sensor.channels) / sensor.sampling_rate
-            yield FifoSession(
-                stream,
-                settings,
-                decoder,
-                information=(information,),
-                clock=clock,
-                patience=settings.patience or max(interface.DEFAULT_PATIENCE, kept),
-            )
+            kept = (capacity or 0) / n_channels / rate
+            patience = settings.patience or max(interface.DEFAULT_PATIENCE, kept)
+            yield FifoSession(stream, settings, decoder, (information,), clock, patience)
 
 
 def _check_rate(sensor: Sensor, settings: FifoSettings) -> None:

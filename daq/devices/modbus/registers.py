@@ -314,16 +314,9 @@ class RegisterDriver(Driver[RegisterSettings]):
         """Open the bus and test which of its devices reply."""
         polled = self.check(sensors)
         first = polled[0].settings
-        async with open_bus(
-            sensors[0].port,
-            clock,
-            label=port_label(sensors),
-            reply_timeout=first.timeout,
-            baud_rate=first.baud_rate,
-            parity=first.parity,
-            stop_bits=first.stop_bits,
-            echo=first.echo,
-        ) as bus:
+        line = first.model_dump(include={"baud_rate", "parity", "stop_bits", "echo"})
+        port, label = sensors[0].port, port_label(sensors)
+        async with open_bus(port, clock, label=label, reply_timeout=first.timeout, **line) as bus:
             information = await answering(
                 {one.sensor.name: partial(one.prepare, bus) for one in polled}
             )

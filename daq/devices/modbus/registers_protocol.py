@@ -16,7 +16,7 @@ The simulated device encodes with the same map.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -101,8 +101,7 @@ class RegisterMap:
         """
         given = {key: value for key, value in settings.items() if value is not None}
         chosen = {**PRESETS.get(given.get("preset", ""), {}), **given}
-        data_type: DataType = chosen.get("data_type", "int16")
-        words = np.dtype(data_type).itemsize // 2
+        words = np.dtype(chosen.get("data_type", "int16")).itemsize // 2
         if "addresses" in chosen:
             addresses = tuple(chosen["addresses"])
         elif "address" in chosen:
@@ -115,15 +114,9 @@ class RegisterMap:
             )
         if "time_format" in chosen and "time_address" not in chosen:
             raise DeviceSettingError("time_format", "expected with time_address only")
-        found = cls(
-            function=chosen.get("function", 3),
-            addresses=addresses,
-            data_type=data_type,
-            word_order=chosen.get("word_order", "big"),
-            counter_address=chosen.get("counter_address"),
-            time_address=chosen.get("time_address"),
-            time_format=chosen.get("time_format", "uint32-ms"),
-        )
+        names = {field.name for field in fields(cls)}
+        own = {key: value for key, value in chosen.items() if key in names}
+        found = cls(**{"function": 3, **own, "addresses": addresses})
         end = max(address + words for address, words in found._extents)
         if end > N_ADDRESSES:
             raise DeviceSettingError(

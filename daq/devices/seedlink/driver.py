@@ -447,14 +447,8 @@ def _information(link: _Link) -> tuple[DeviceInformation, ...]:
             "protocol": f"SeedLink {server.version}{', encrypted' if server.is_encrypted else ''}",
             "streams": ", ".join(decoder.streams(sensor.name)),
         }
-        found.append(
-            DeviceInformation(
-                sensor=sensor.name,
-                model=sensor.model,
-                sampling_rate=decoder.sampling_rate(sensor.name),
-                details=details,
-            )
-        )
+        name, model, rate = sensor.name, sensor.model, decoder.sampling_rate(sensor.name)
+        found.append(DeviceInformation(name, model, sampling_rate=rate, details=details))
     if all(one.trouble for one in found):
         error = WrongDeviceError if decoder.refused else NoAnswerError
         raise error(found[0].trouble)

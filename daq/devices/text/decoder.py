@@ -441,13 +441,10 @@ class TextDecoder:
             self._times.arrived(groups[-1].received)
 
     def _place(self, group: Group, n_behind: int) -> SamplePlace:
+        is_damaged, width = self._n_unreadable > self._n_explained, group.resolution_ns
+        placed = group.time_ns, len(group.counts), group.received
         return self._times.place(
-            group.time_ns,
-            len(group.counts),
-            group.received,
-            resolution_ns=group.resolution_ns,
-            n_behind=n_behind,
-            is_damaged=self._n_unreadable > self._n_explained,
+            *placed, resolution_ns=width, n_behind=n_behind, is_damaged=is_damaged
         )
 
     def _decided(self, place: SamplePlace, at: HostTime) -> Iterator[Block | Event]:
