@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 PATIENCE = float(os.environ.get("HUDDLE_TEST_PATIENCE", "1"))
 USUAL = 300.0
@@ -33,6 +35,13 @@ def wait_until(reached: Callable[[], bool], what: str, *, seconds: float = USUAL
         assert looked < deadline, f"after {limit(seconds):g} s not yet: {what}"
         time.sleep(max(LOOK, (looked - began) / SHARE))
         began = time.monotonic()
+
+
+def python(code: str, *arguments: object, **more: Any) -> subprocess.CompletedProcess[str]:  # noqa: ANN401
+    """Run code in an interpreter of its own, until it ends; return what it said."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    options = {"capture_output": True, "timeout": limit(), **more}
+    return subprocess.run(command, text=True, check=False, **options)
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import textwrap
 import tomllib
 from typing import Any
@@ -16,6 +14,7 @@ from sim_devices.world import scenario as scenario_module
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.spectrum import White
 from sim_devices.world.world import World
+from tests.waiting import python
 
 THREE_DIRECTIONS = {"spectra": [{"shape": "white", "level": 1.0}] * 3}
 
@@ -120,4 +119,4 @@ def test_true_noise_is_that_of_the_channel() -> None:
 
 def test_the_description_loads_no_scipy() -> None:
     code = "import sys, sim_devices.world.scenario; sys.exit('scipy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert python(code).returncode == 0

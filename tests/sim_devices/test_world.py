@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from scipy import signal
 from sim_devices.arrays import ComplexArray, FloatArray
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import GaussianSeries, Motion, WhiteSources, World
+from tests.waiting import python
 
 RATE = 200.0
 
@@ -118,13 +117,7 @@ def test_another_process_makes_the_same_samples() -> None:
         "s = World(Scenario.from_dict(json.load(sys.stdin)));"
         "print(json.dumps(s.samples('A', 10**9, 50).tolist()))"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", code],
-        input=json.dumps(model.to_dict()),
-        capture_output=True,
-        check=True,
-        text=True,
-    )
+    said = python(code, input=json.dumps(model.to_dict()))
     assert np.array_equal(json.loads(said.stdout), World(model).samples("A", 10**9, 50))
 
 

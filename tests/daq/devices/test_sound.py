@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from daq.errors import BenchFileError
 from daq.host_clock import SystemClock
 from daq.protocols.block import BlockFlag
 from tests.sensors import sensor_at
-from tests.waiting import limit
+from tests.waiting import python
 
 RATE = 8000.0
 DRIVER = driver_type("sound")
@@ -94,14 +92,8 @@ def read(folder: Path, port: str, n_samples: int) -> Any:  # noqa: ANN401
     """Read the card in a process of its own: ALSA reads its configuration once."""
     (folder / "card.raw").write_bytes(played().astype("<i4").tobytes())
     (folder / "asound.conf").write_text(CARD.format(file=folder / "card.raw"), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-c", READ, port, str(n_samples)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "ALSA_CONFIG_PATH": f"{ALSA}:{folder / 'asound.conf'}"},
-        timeout=limit(),
-    )
+    environment = {**os.environ, "ALSA_CONFIG_PATH": f"{ALSA}:{folder / 'asound.conf'}"}
+    done = python(READ, port, n_samples, env=environment)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

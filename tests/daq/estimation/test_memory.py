@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 import numpy as np
@@ -17,6 +16,7 @@ from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.spectra.parts import Part, Parts
 from estimator.spectra.welch import SegmentSpectra
 from tests.traced_memory import peak_of
+from tests.waiting import python
 
 _AFTER_MANY_ARRAYS = """
 import numpy as np
@@ -41,10 +41,7 @@ print(resident() - before)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads its memory from /proc")
 def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", _AFTER_MANY_ARRAYS], capture_output=True, text=True, check=True
-    )
-    assert float(ended.stdout) < 20.0
+    assert float(python(_AFTER_MANY_ARRAYS).stdout) < 20.0
 
 
 _ARRAYS_AGAIN = """
@@ -66,10 +63,7 @@ print(faults())
 
 @pytest.mark.skipif(sys.platform != "linux", reason="its C library may keep no memory")
 def test_an_estimate_makes_arrays_in_the_memory_of_freed_ones() -> None:
-    ended = subprocess.run(
-        [sys.executable, "-c", _ARRAYS_AGAIN], capture_output=True, text=True, check=True
-    )
-    again, later = map(int, ended.stdout.split())
+    again, later = map(int, python(_ARRAYS_AGAIN).stdout.split())
     pages = 20 * 24_000_000 // 4096
     assert again < pages / 100 < pages / 20 < later  # some pages are large ones
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.scripted_driver import counts
-from tests.waiting import limit
+from tests.waiting import python
 
 pytestmark = pytest.mark.virtual_time
 
@@ -41,13 +39,7 @@ except RecordingError as error:
 def test_a_full_disk_ends_the_run_with_an_error(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     # A process of its own: HDF5 may crash the interpreter when it exits with what it cannot write.
-    said = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(path)],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=limit(),
-    )
+    said = python(FULL_DISK, path)
     safe = "0 s of every sensor are safe"  # the disk refused before the first commit
     assert said.stdout == f"{path}: cannot be written: File too large; {safe}\n", said.stderr
     report = verify(path)
@@ -100,13 +92,7 @@ asyncio.run(main())
 
 def test_a_recording_continues_in_another_file_after_a_disk_error(tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
-    said = subprocess.run(
-        [sys.executable, "-c", REFUSED_ONCE, str(path)],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=limit(),
-    )
+    said = python(REFUSED_ONCE, path)
     following = path.with_stem("r-2")
     assert said.stdout.split()[::2] == ["True", str(following)], said.stderr
     assert "cannot be written: File too large; the recording continues in" in said.stderr
@@ -159,12 +145,6 @@ def test_interrupted_twice_a_run_ends_properly_whatever_its_driver_does(
     tmp_path: Path, how: str
 ) -> None:
     path = tmp_path / "r.h5"
-    said = subprocess.run(
-        [sys.executable, "-c", STUBBORN, str(path), how],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=limit(),
-    )
+    said = python(STUBBORN, path, how)
     assert (said.returncode, said.stdout) == (0, "True\n"), said.stderr
     assert verify(path).closed

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
 import sys
 
 import pytest
 
-from tests.waiting import limit
+from tests.waiting import limit, python
 from tui.service.processes.finish import OOM_SCORE
 from tui.service.processes.steps import FinishFailedError, outcome_of
 
@@ -38,10 +37,7 @@ def test_an_estimate_dies_before_a_recorder() -> None:
         "from tui.service.processes.finish import die_first; die_first();"
         " print(open('/proc/self/oom_score_adj').read())"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert int(said) == OOM_SCORE
+    assert int(python(program).stdout) == OOM_SCORE
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of the Linux kernel")
@@ -51,9 +47,7 @@ def test_an_estimate_has_a_share_of_the_memory() -> None:
         " size = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE');"
         " limit_memory(0.1); bytearray(size // 5)"
     )
-    ended = subprocess.run(
-        [sys.executable, "-c", program], check=False, capture_output=True, text=True
-    )
+    ended = python(program)
     assert ended.returncode == 1
     assert ended.stderr.rstrip().endswith("MemoryError")
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
+from tests.waiting import python
 from tui.studies.laboratory import HANN, SHOWN, measure, smoothed
 from tui.studies.numerical import (
     BAND,
@@ -201,7 +200,7 @@ def test_the_command_line_refuses_an_unknown_study_and_loads_no_matplotlib() -> 
         "try:\n    command.main(['reproduce', 'fig6'])\n"
         "finally:\n    print('tui.studies.reproduce' in sys.modules, 'matplotlib' in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    said = python(code)
     assert said.returncode == 2
     assert "no study 'fig6'" in said.stderr
     assert said.stdout.split() == ["True", "False"]
