@@ -28,7 +28,6 @@ RATE = 50.0
 STILL = 1e-6  # a world so slow that every reading is the same
 AGE = 5.01
 COUNTS_PER_UNIT = 1e5
-CHANNELS = [{"name": axis, "sensitivity": COUNTS_PER_UNIT} for axis in "xyz"]
 SLAVE = 0x50
 
 
@@ -47,7 +46,7 @@ def slave(request: pytest.FixtureRequest) -> Iterator[tuple[str, RunningDevice]]
         port="tcp" if request.param == "tcp" else "pty",
         sampling_rate=RATE,
         settings={"address": 0x34, "device_id": SLAVE},
-        channels={"A": CHANNELS},
+        sensitivity=COUNTS_PER_UNIT,
     )
     with serving(spec(table, speed=STILL, age=AGE, sampling_rate=RATE)) as (one,):
         yield request.param, one

@@ -30,13 +30,7 @@ def test_obspy_reads_our_server() -> None:
         warnings.simplefilter("ignore")
         easy = pytest.importorskip("obspy.clients.seedlink.easyseedlink")
     settings = {"network": "XX", "station": "STA", "channels": ["HNZ", "HNN", "HNE"]}
-    table = device(
-        "A",
-        "seedlink",
-        port="tcp",
-        settings=settings,
-        channels={"A": [{"name": n, "sensitivity": 1e6} for n in "ZNE"]},
-    )
+    table = device("A", "seedlink", port="tcp", settings=settings, axes="ZNE", sensitivity=1e6)
     world = spec(table, speed=4.0)
     traces: list[Any] = []
 

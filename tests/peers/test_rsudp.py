@@ -60,7 +60,8 @@ def test_rsudp_reads_our_packets(tmp_path: Path) -> None:
         port="udp",
         sampling_rate=RATE,
         settings={"preset": "raspberry-shake"},
-        channels={"A": [{"name": name, "sensitivity": COUNTS} for name in NAMES]},
+        axes=NAMES,
+        sensitivity=COUNTS,
     )
     made = spec(table, speed=8.0, sampling_rate=RATE)
     with serving(made) as (one,), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from daq.bench.channel import Channel
@@ -28,15 +29,22 @@ def scenario(names: Sequence[str], *, sampling_rate: float = RATE) -> Scenario:
     return Scenario.from_dict(table, sampling_rate=sampling_rate)
 
 
-def device(name: str, driver: str = "epson", **changes: Any) -> dict[str, Any]:  # noqa: ANN401
+def device(
+    name: str,
+    driver: str = "epson",
+    *,
+    axes: Iterable[str] = "xyz",
+    sensitivity: float = commands.COUNTS_PER_UNIT,
+    **changes: Any,  # noqa: ANN401 -- whatever a table holds
+) -> dict[str, Any]:
     """One device of a specification."""
-    channels = [*AXES, TEMPERATURE] if driver == "epson" else list(AXES)
+    channels: list[dict[str, Any]] = [{"name": axis, "sensitivity": sensitivity} for axis in axes]
     return {
         "sensors": [name],
         "driver": driver,
         "port": "pty",
         "sampling_rate": RATE,
-        "channels": {name: channels},
+        "channels": {name: [*channels, TEMPERATURE] if driver == "epson" else channels},
         **changes,
     }
 
@@ -57,11 +65,14 @@ def spec(
 def bench_of(
     running: Sequence[RunningDevice],
     tables: Sequence[dict[str, Any]],
+    settings: Mapping[str, Any] = MappingProxyType({}),
     **changes: Any,  # noqa: ANN401 -- whatever a bench holds
 ) -> Bench:
-    """Return the bench of running devices, each beside its table."""
+    """Return the bench of running devices, each beside its table, with further settings."""
     every = tuple(
-        sensor for one, table in zip(running, tables, strict=True) for sensor in sensors(one, table)
+        sensor
+        for one, table in zip(running, tables, strict=True)
+        for sensor in sensors(one, table, settings={**one.settings, **settings})
     )
     return Bench(name="simulated", sampling_rate=RATE, sensors=every, **changes)
 

@@ -34,11 +34,10 @@ pytestmark = pytest.mark.devices
 RATE = 2000.0
 COUNTS = 100_000.0
 DRIVER = driver_type("fifo")
-CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "xyz"]
 
 
 def table(name: str, *, rate: float = RATE, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
-    return device(name, "fifo", channels={name: CHANNELS}, sampling_rate=rate, **changes)
+    return device(name, "fifo", sensitivity=COUNTS, sampling_rate=rate, **changes)
 
 
 TABLE = table("A", settings={"capacity": 6000})

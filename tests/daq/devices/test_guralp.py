@@ -31,12 +31,11 @@ pytestmark = pytest.mark.devices
 SPEED = 8.0
 RATE = 200.0
 COUNTS = 1e7
-CHANNELS = [{"name": axis, "sensitivity": COUNTS} for axis in "ZNE"]
 DRIVER = driver_type("guralp")
 
 
 def table(name: str, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 -- whatever a table holds
-    return device(name, "guralp", channels={name: CHANNELS}, **changes)
+    return device(name, "guralp", axes="ZNE", sensitivity=COUNTS, **changes)
 
 
 TABLES = [

@@ -39,11 +39,7 @@ def served(credentials: str, request: pytest.FixtureRequest) -> Iterator[Running
     more: dict[str, Any] = getattr(request, "param", {"tls": True})
     settings = {"network": "XX", "station": "STA", "credentials": credentials, **more}
     table = device(
-        "A",
-        "seedlink",
-        port="tcp",
-        settings=settings,
-        channels={"A": [{"name": n, "sensitivity": 1e6} for n in ("HNZ", "HNN", "HNE")]},
+        "A", "seedlink", port="tcp", settings=settings, axes=("HNZ", "HNN", "HNE"), sensitivity=1e6
     )
     with serving(spec(table, speed=4.0)) as (one,):
         yield one

@@ -51,7 +51,8 @@ def table(index: int) -> dict[str, Any]:
     return device(
         name,
         "text",
-        channels={name: [{"name": n, "sensitivity": COUNTS} for n in names]},
+        axes=names,
+        sensitivity=COUNTS,
         port=PORTS[index],
         sampling_rate=RATES[index],
         settings=SETTINGS[index],

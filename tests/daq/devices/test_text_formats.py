@@ -33,7 +33,8 @@ TABLES = [
         "text",
         port="tcp",
         sampling_rate=100.0,
-        channels={name: [{"name": n, "sensitivity": 1e5} for n in NAMES]},
+        axes=NAMES,
+        sensitivity=1e5,
         settings=settings,
     )
     for name, settings in FORMATS.items()

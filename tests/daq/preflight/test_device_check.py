@@ -32,11 +32,7 @@ pytestmark = pytest.mark.devices
 SPEED = 4.0
 RATE = 50.0
 POLLED: dict[str, Any] = device(
-    "P",
-    "registers",
-    sampling_rate=RATE,
-    settings={"preset": "witmotion"},
-    channels={"P": [{"name": axis, "sensitivity": 2e5} for axis in "xyz"]},
+    "P", "registers", sampling_rate=RATE, settings={"preset": "witmotion"}, sensitivity=2e5
 )
 TABLES = [device("A", serial_number="A0000007"), POLLED]
 CLOCK = host_clock(SPEED)

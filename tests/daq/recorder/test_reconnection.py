@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from daq.bench.model import Bench
 from daq.devices.epson import commands
 from daq.protocols.block import BlockFlag
 from daq.recorder.recorder import RecorderStatus, record
@@ -24,13 +23,12 @@ from daq.recording.sensor_state import SensorState
 from sim_devices.server.launch import RunningDevice
 from tests.acceptance.sample_accounting import Log, accounts
 from tests.devices import host_clock, serving
-from tests.sim_devices.simulated_bench import bench_of, device, sensors, spec
+from tests.sim_devices.simulated_bench import bench_of, device, spec
 
 pytestmark = pytest.mark.devices
 
 SPEED = 8.0
 EPSON = [{"name": axis, "sensitivity": commands.COUNTS_PER_UNIT} for axis in "xyz"]
-LABJACK = [{"name": axis, "sensitivity": 3e5} for axis in "xyz"]
 EVERY = {"at": 12.0, "every": 45.0}
 CABLE = {"kind": "disconnect", "duration": 9.0, **EVERY}
 POWER = {"kind": "reset", "every": 45.0, "at": 16.0}
@@ -49,7 +47,7 @@ CASES: dict[str, tuple[str, list[dict[str, Any]]]] = {
 def table(name: str, driver: str) -> dict[str, Any]:
     if driver == "epson":
         return device(name, channels={name: EPSON})
-    return device(name, driver, port="tcp", channels={name: LABJACK})
+    return device(name, driver, port="tcp", sensitivity=3e5)
 
 
 @contextlib.asynccontextmanager
@@ -78,16 +76,7 @@ async def test_gaps_are_exact_if_the_device_continued_to_count(tmp_path: Path) -
             stop.set()
 
     async with started(told) as running:
-        every = zip(running, tables, strict=True)
-        bench = Bench(
-            name="simulated",
-            sampling_rate=200.0,
-            sensors=tuple(
-                sensor
-                for one, table_ in every
-                for sensor in sensors(one, table_, settings={**one.settings, "patience": 2.0})
-            ),
-        )
+        bench = bench_of(running, tables, {"patience": 2.0})
         path = tmp_path / "r.h5"
         clock = host_clock(SPEED)
         while not stop.is_set():  # a cable may just be out
@@ -152,12 +141,8 @@ async def test_a_stall_is_detected_in_two_block_periods_and_a_lost_block_is_no_s
 
     path = tmp_path / "r.h5"
     async with started(told) as (one,):
-        settings = {**one.settings, "samples_per_packet": 500, "patience": 0.5}
-        bench = Bench(
-            name="simulated",
-            sampling_rate=200.0,
-            sensors=tuple(sensors(one, table("L", "labjack"), settings=settings)),
-        )
+        settings = {"samples_per_packet": 500, "patience": 0.5}
+        bench = bench_of([one], [table("L", "labjack")], settings)
         await record(bench, path, clock=host_clock(speed), stop=stop, acknowledged=acknowledged)
     states = [status.sensors["L"].state for status in statuses]
     noticed_at = [is_stalled(status) for status in statuses].index(True)

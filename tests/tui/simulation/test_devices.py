@@ -60,10 +60,10 @@ def test_help_of_the_demo_says_what_it_does_unless_told() -> None:
 
 def test_simulated_ports_of_the_network_are_known_by_every_address() -> None:
     """As bench files have them: with a path for each device of a board, by name, with a slash."""
-    station = {"sensor_settings": {"seedlink": {"station": "XX_A", "streams": ["H_H_X"] * 3}}}
+    station = {"seedlink": {"station": "XX_A", "streams": ["H_H_X"] * 3}}
     tables = [
         device("iio", "iio", port="tcp"),
-        device("seedlink", "seedlink", port="tcp", **station),
+        device("seedlink", "seedlink", port="tcp", sensor_settings=station),
     ]
     with serving(spec(*tables)) as running:
         board, server = (each.port for each in running)
