@@ -26,6 +26,7 @@ from daq.errors import BenchFileError, NoAnswerError, WrongDeviceError
 from daq.host_clock import SystemClock
 from daq.protocols import block
 from daq.protocols.block import Block, BlockFlag, DeviceItem, HostTime, Quantity, Reading
+from tests.daq.devices.found import blocks_of, indices
 from tests.daq.devices.simulated_can_bus import BUS_CELSIUS, SimulatedBus, encode_sample
 from tests.sensors import sensor_at
 
@@ -114,7 +115,7 @@ async def test_devices_on_one_bus_have_one_clock() -> None:
             for one in bench:
                 node = NODES[one.name]
                 check_truth(one, found, Sent(counts(node, 0, len(due)), due))
-                blocks = [b for b in found if isinstance(b, Block) and b.sensor == one.name]
+                blocks = blocks_of(found, one.name)
                 np.testing.assert_array_equal(blocks[0].counts[0], counts(node, 0, 1)[0])
 
 
@@ -147,8 +148,8 @@ async def test_lost_messages_are_gaps_of_their_sensor() -> None:
         simulated.lost = {(1, 0, 20), (2, 1, 33), (2, 0, 34), (2, 0, 0), (2, 1, 0)}
         found = await read(sensors(channel, "A", "B"), 80)
     for name, node, lost in (("A", 1, {20}), ("B", 2, {0, 33, 34})):
-        blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
-        index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
+        blocks = blocks_of(found, name)
+        index = indices(blocks)
         assert set(range(80)) - set(index) == lost
         rows = np.concatenate([block.counts for block in blocks])
         np.testing.assert_array_equal(rows, counts(node, 0, index[-1] + 1)[index])
@@ -224,7 +225,7 @@ def test_messages_cut_anywhere_are_decoded() -> None:
             for item in decoder.receive(line[k : k + step], HostTime(10**9 + k * 2 * 10**6, 0))
         ]
         for name, node in (("A", 1), ("B", 2)):
-            blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+            blocks = blocks_of(found, name)
             np.testing.assert_array_equal(
                 np.concatenate([b.counts for b in blocks]), counts(node, 0, 50)
             )

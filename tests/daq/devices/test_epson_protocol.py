@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from daq.devices.epson import commands
 from daq.devices.epson.burst import BurstDecoder
 from daq.devices.epson.commands import BurstFormat, CommandDecoder, Read, Write
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime, Reading
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, Reading
+from tests.daq.devices.found import at, blocks_of, events_of, only
 
 RATE = 200.0
 ALL = BurstFormat.of("flag", "temperature", "x", "y", "z", "count", "checksum")
@@ -26,10 +27,6 @@ GOLDEN = bytes.fromhex(
     "A64B"  # sum of the words between header and checksum
     "0D"
 )
-
-
-def at(seconds: float) -> HostTime:
-    return HostTime(round(seconds * 1e9), 0)
 
 
 def decoder(burst: BurstFormat = ALL, rate: float = RATE) -> BurstDecoder:
@@ -93,10 +90,9 @@ def test_frame_lengths(burst: BurstFormat, size: int) -> None:
 def test_a_golden_burst_is_encoded_and_decoded() -> None:
     values = {"flag": 0x8E00, "temperature": 2637, "x": 2**24, "y": -(2**24), "z": 0x00800D80}
     assert commands.encode_bursts(ALL, **values, count=65534) == GOLDEN
-    block, reading = decoder().receive(GOLDEN, at(0))
-    assert isinstance(block, Block)
-    assert isinstance(reading, Reading)
-    assert reading.value == pytest.approx(24.988, abs=1e-3)
+    found = decoder().receive(GOLDEN, at(0))
+    block = only(Block, found[:1])
+    assert only(Reading, found[1:]).value == pytest.approx(24.988, abs=1e-3)
     assert block.counts.tolist() == [[2**24, -(2**24), 0x00800D80, 2637]]
     assert (block.first_sample, block.device_counter) == (0, 65534)
     assert block.flags == BlockFlag.CLOCK_RESTART
@@ -147,10 +143,10 @@ def test_a_wrong_checksum_is_a_gap_of_one_sample() -> None:
     stream = bytearray(frames(0, 10))
     stream[24 * 4 + 9] ^= 0x40
     found = decoder().receive(bytes(stream), at(0.05))
-    blocks = [item for item in found if isinstance(item, Block)]
+    blocks = blocks_of(found)
     assert [(b.first_sample, b.n_samples) for b in blocks] == [(0, 4), (5, 5)]
     assert blocks[1].reason == "1 sample not received"
-    assert [(e.kind, e.text) for e in found if isinstance(e, Event)] == [
+    assert [(e.kind, e.text) for e in events_of(found)] == [
         ("checksum", "1 frame with a wrong checksum")
     ]
 
@@ -159,7 +155,7 @@ def test_lost_bytes_are_counted_and_decoding_continues() -> None:
     stream = frames(0, 10)
     found = decoder().receive(stream[: 24 * 3 + 5] + stream[24 * 6 + 2 :], at(0.05))
     assert sorted(samples(found)) == [0, 1, 2, 7, 8, 9]
-    (event,) = [item for item in found if isinstance(item, Event)]
+    (event,) = events_of(found)
     assert event.kind == "resynchronised"
     assert event.text.startswith("27 bytes")
 
@@ -168,15 +164,15 @@ def test_a_wrap_of_count_is_no_gap() -> None:
     one = decoder()
     found = one.receive(frames(65530, 20), at(0))
     assert list(samples(found)) == list(range(20))
-    assert [b.device_counter for b in found if isinstance(b, Block)] == [65530]
+    assert [b.device_counter for b in blocks_of(found)] == [65530]
 
 
 @pytest.mark.parametrize("missing", [1, 199, 65535, 65536 + 300, 3 * 65536 + 5])
 def test_a_gap_is_exact_for_any_number_of_wraps(missing: int) -> None:
     one = decoder()
     one.receive(frames(0, 200), at(1))
-    block, *_ = one.receive(frames(200 + missing, 1), at(1 + (missing + 1) / RATE + 0.004))
-    assert isinstance(block, Block)
+    found = one.receive(frames(200 + missing, 1), at(1 + (missing + 1) / RATE + 0.004))
+    block = only(Block, found[:1])
     assert block.first_sample == 200 + missing
     assert not block.flags
 
@@ -185,17 +181,15 @@ def test_repeated_frames_are_dropped() -> None:
     one = decoder()
     found = one.receive(frames(0, 20) + frames(12, 8) + frames(20, 5), at(0.1))
     assert samples(found) == samples(decoder().receive(frames(0, 25), at(0.1)))
-    assert [e.text for e in found if isinstance(e, Event)] == ["8 frames received twice"]
+    assert [e.text for e in events_of(found)] == ["8 frames received twice"]
 
 
 def test_a_reset_restarts_the_clock_and_estimates_the_gap() -> None:
     one = decoder()
     one.receive(frames(30000, 400), at(2))
     found = one.receive(frames(0, 10), at(5.05))
-    event, block = found
-    assert isinstance(event, Event)
-    assert isinstance(block, Block)
-    assert event.kind == "reset"
+    assert only(Event, found[:1]).kind == "reset"
+    block = only(Block, found[1:])
     assert block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
     assert abs(block.first_sample - 1000) <= 1
     assert block.device_counter == 0
@@ -204,13 +198,10 @@ def test_a_reset_restarts_the_clock_and_estimates_the_gap() -> None:
 @pytest.mark.parametrize("end", [-15 * 2**24, 15 * 2**24])
 def test_clipping_and_errors_are_reported(end: int) -> None:
     values = {"temperature": 0, "x": end, "y": 0, "z": 0}
-    (block, event) = decoder().receive(
-        commands.encode_bursts(ALL, flag=0x8E01, **values, count=0), at(0)
-    )
-    assert isinstance(block, Block)
-    assert BlockFlag.CLIPPED in block.flags
-    assert isinstance(event, Event)
-    assert event.kind == "status"
+    sent = commands.encode_bursts(ALL, flag=0x8E01, **values, count=0)
+    found = decoder().receive(sent, at(0))
+    assert BlockFlag.CLIPPED in only(Block, found[:1]).flags
+    assert only(Event, found[1:]).kind == "status"
 
 
 @pytest.mark.parametrize("missing", [0, 1, 7000, 65535, 65536, 5 * 65536 + 300])
@@ -224,7 +215,7 @@ def test_a_stream_that_continued_while_disconnected_is_resumed(missing: int, lat
     one.resume()
     found = one.receive(heard, now)
     assert list(samples(found)) == list(range(201 + missing, 204 + missing))
-    (block,) = [item for item in found if isinstance(item, Block)]
+    (block,) = blocks_of(found)
     assert not block.flags
 
 

@@ -16,13 +16,10 @@ from pymodbus.framer.rtu import FramerRTU
 from daq.devices.modbus import rtu
 from daq.devices.modbus.fifo_protocol import MAX_WORDS, FifoDecoder, Header
 from daq.devices.modbus.rtu import ReplyFinder, RequestFinder, RtuRequest
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime
+from daq.protocols.block import BlockFlag, DeviceItem, Event
+from tests.daq.devices.found import at, blocks_of, events_of, indices, only
 
 RATE = 7812.0
-
-
-def at(seconds: float) -> HostTime:
-    return HostTime(round(seconds * 1e9), 0)
 
 
 # --- frames ----------------------------------------------------------------------------------
@@ -112,8 +109,7 @@ def test_unexpected_bytes_are_described_and_counted(line: bytes, said: str) -> N
     for n in (1, 2):
         decoder.request()
         assert decoder.receive(line, at(1)) == []
-        (event,) = decoder.timed_out(at(2))
-        assert isinstance(event, Event)
+        event = only(Event, decoder.timed_out(at(2)))
         assert event.text == f"no reply to a read: {said} ({n} so far)"
         assert event.kind == ("resynchronised" if line else "status")
 
@@ -195,9 +191,8 @@ def run(
 
 
 def numbered(found: list[DeviceItem]) -> tuple[list[int], NDArray[Any]]:
-    blocks = [b for b in found if isinstance(b, Block)]
-    index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
-    return index, np.concatenate([b.counts for b in blocks])
+    blocks = blocks_of(found)
+    return indices(blocks), np.concatenate([b.counts for b in blocks])
 
 
 @pytest.mark.parametrize("header", ["size", "left"])
@@ -213,7 +208,7 @@ def test_all_words_in_the_fifo_are_read_once(header: Header) -> None:
     for _ in range(4):
         run(device, decoder, 1)
         assert decoder.level == len(device.waiting) <= MAX_WORDS, "it knows, and keeps up"
-    flags = [b.flags for b in found if isinstance(b, Block)]
+    flags = [b.flags for b in blocks_of(found)]
     assert flags[0] == BlockFlag.CLOCK_RESTART
     assert set(flags[1:]) == {BlockFlag.NONE}
 
@@ -237,10 +232,10 @@ def test_unanswered_reads_lose_no_samples_silently(header: Header, reached: bool
     missing = [b - a - 1 for a, b in itertools.pairwise(index) if b != a + 1]
     assert missing == (lost if reached and lost[0] else [])
     np.testing.assert_array_equal(counts[:, 0].astype(int) - index, counts[0, 0])
-    hurt_blocks = [b for b in found if isinstance(b, Block) and b.reason]
+    hurt_blocks = [b for b in blocks_of(found) if b.reason]
     assert [b.reason for b in hurt_blocks] == (["lost reply"] if missing else [])
     assert all(b.flags == BlockFlag.MISSING_ESTIMATED for b in hurt_blocks)
-    guessed = [b for b in found if isinstance(b, Block) and b.flags & BlockFlag.MISSING_ESTIMATED]
+    guessed = [b for b in blocks_of(found) if b.flags & BlockFlag.MISSING_ESTIMATED]
     assert len(guessed) == bool(lost[0]), "clocks begin anew where the index may be wrong"
 
 
@@ -254,13 +249,13 @@ def test_an_overflow_is_a_gap_of_estimated_length(header: Header) -> None:
         device.advance(8)
         found += decoder.receive(device.answer(decoder.request()), at(2.05 + i * 1e-3))
     index, _ = numbered(found)
-    gap = next(b for b in found if isinstance(b, Block) and b.reason)
+    gap = next(b for b in blocks_of(found) if b.reason)
     assert gap.reason == "FIFO full"
     assert gap.flags == BlockFlag.MISSING_ESTIMATED
     where = index.index(gap.first_sample)
     missing = index[where] - index[where - 1] - 1
     assert missing == pytest.approx(device.dropped, abs=8 * 3)
-    assert any(isinstance(e, Event) and e.kind == "overflow" for e in found)
+    assert any(e.kind == "overflow" for e in events_of(found))
 
 
 @pytest.mark.parametrize("header", ["size", "left"])
@@ -273,10 +268,10 @@ def test_a_fifo_that_stays_full_loses_a_little_each_time(header: Header) -> None
         device.advance(100 if i > 5 else 10)
         found += decoder.receive(device.answer(decoder.request()), at(i * 1e-3))
     assert device.dropped > 5000
-    assert sum(isinstance(item, Event) for item in found) == 1
+    only(Event, events_of(found))
     index, counts = numbered(found)
     made = counts[:, 0].astype(int)
-    assert sum(isinstance(b, Block) and b.reason == "FIFO full" for b in found) > 50
+    assert sum(b.reason == "FIFO full" for b in blocks_of(found)) > 50
     late = np.array(index) - made
     assert np.ptp(late[made > made[-1] - 5000]) <= 100
 
@@ -294,12 +289,12 @@ def test_zeros_behind_the_words_of_a_restarted_device_are_no_samples() -> None:
         found += decoder.receive(device.answer(decoder.request()), at(i * 1e-3))
     index, counts = numbered(found)
     made = counts[:, 0].astype(int)
-    emptied = next(b for b in found if isinstance(b, Block) and b.reason)
+    emptied = next(b for b in blocks_of(found) if b.reason)
     assert emptied.reason == "FIFO emptied"
     assert emptied.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
     assert (np.diff(made) > 0).all(), "no zeros"
     assert np.ptp(made - index) <= 16, "placed by host time"
-    (event,) = (item for item in found if isinstance(item, Event))
+    (event,) = events_of(found)
     assert (event.kind, event.text) == (
         "reset",
         "12 words in the FIFO, expected 24: the device was restarted",
@@ -313,14 +308,13 @@ def test_no_words_are_discarded_if_the_header_setting_is_wrong() -> None:
     assert index == list(range(len(index)))
     assert len(index) > 2300
     assert set((np.diff(counts[:, 0].astype(int)) % 30000).tolist()) == {1}
-    assert not any(isinstance(item, Event) for item in found)
+    assert not events_of(found)
 
 
 def test_refusals_are_reported() -> None:
     decoder = FifoDecoder("A", RATE)
     decoder.request()
-    (event,) = decoder.receive(rtu.encode_exception(1, 4, 2), at(1))
-    assert isinstance(event, Event)
+    event = only(Event, decoder.receive(rtu.encode_exception(1, 4, 2), at(1)))
     assert (event.kind, event.text) == (
         "refused",
         "the device refused a read: illegal data address (1 so far)",
@@ -332,7 +326,7 @@ def test_clipping_is_flagged() -> None:
     run(device, decoder, 3)
     device.waiting = [32767, 0, 0] * 8
     found = decoder.receive(device.answer(decoder.request()), at(1))
-    assert any(isinstance(b, Block) and b.flags & BlockFlag.CLIPPED for b in found)
+    assert any(b.flags & BlockFlag.CLIPPED for b in blocks_of(found))
 
 
 @settings(max_examples=100)

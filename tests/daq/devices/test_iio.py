@@ -16,8 +16,9 @@ from daq.devices.iio.protocol import IioDevice, ScanElement, ScanLayout
 from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import WrongDeviceError
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime, Quantity, Reading
+from daq.protocols.block import BlockFlag, DeviceItem, HostTime, Quantity, Reading
 from sim_devices.server.launch import RunningDevice
+from tests.daq.devices.found import blocks_of, events_of, indices
 from tests.daq.devices.reading import reading, record
 from tests.devices import serving
 from tests.sim_devices.simulated_bench import device, sensors, spec
@@ -118,7 +119,7 @@ def test_lost_scans_are_gaps_where_the_times_have_them(jitter: float) -> None:
     """Within a buffer and between two; the value of each scan is its number."""
     first = [*range(3)], [*range(3, 6)], [*range(6, 13), *range(17, 30)]
     numbers = *first, [*range(30, 40), *range(140, 150)], [*range(150, 160)], [*range(190, 200)]
-    blocks = [b for b in decoded(*numbers, jitter=jitter) if isinstance(b, Block)]
+    blocks = blocks_of(decoded(*numbers, jitter=jitter))
     for block in blocks:
         assert block.counts[:, 0].tolist() == list(range(block.first_sample, block.end_sample))
         assert BlockFlag.MISSING_ESTIMATED not in block.flags
@@ -136,12 +137,10 @@ def test_scans_of_a_clock_that_is_set_are_all_kept(step: float) -> None:
     buffers = np.split(numbers, range(20, 4000, 20))
     arrivals = [float(n[-1] + RATE * rng.exponential(5e-4)) for n in buffers]
     found = decoded(*buffers, arrivals=arrivals, stated=stated)
-    blocks = [item for item in found if isinstance(item, Block)]
-    index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
-    rows = np.concatenate([b.counts[:, 0] for b in blocks])
-    assert np.array_equal(index, numbers)
-    assert np.array_equal(rows, numbers)
-    assert [item.kind for item in found if isinstance(item, Event)] == ["reset"]
+    blocks = blocks_of(found)
+    assert np.array_equal(indices(blocks), numbers)
+    assert np.array_equal(np.concatenate([b.counts[:, 0] for b in blocks]), numbers)
+    assert [item.kind for item in events_of(found)] == ["reset"]
 
 
 @pytest.mark.parametrize("n_lost", [5, 60, 900])
@@ -150,7 +149,7 @@ def test_scans_lost_in_steady_buffers_are_an_exact_gap(n_lost: int) -> None:
     numbers = np.array([n for n in range(4000) if not 2007 <= n < 2007 + n_lost])
     buffers = np.split(numbers, range(20, len(numbers), 20))
     arrivals = [float(n[-1] + RATE * rng.exponential(5e-4)) for n in buffers]
-    blocks = [b for b in decoded(*buffers, arrivals=arrivals) if isinstance(b, Block)]
+    blocks = blocks_of(decoded(*buffers, arrivals=arrivals))
     assert [b.first_sample for b in blocks if b.reason] == [2007 + n_lost]
     assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in blocks)
     assert all(b.counts[:, 0].tolist() == [*range(b.first_sample, b.end_sample)] for b in blocks)
@@ -159,6 +158,6 @@ def test_scans_lost_in_steady_buffers_are_an_exact_gap(n_lost: int) -> None:
 def test_scans_lost_while_the_network_was_held_up_are_a_gap() -> None:
     """The board's buffer was read late, and had overflowed."""
     found = decoded([0, 1, 2], [3, 4, 5], [6, 7], [1006, 1007], arrivals=[2, 5, 1006, 1007])
-    blocks = [item for item in found if isinstance(item, Block)]
+    blocks = blocks_of(found)
     assert [b.first_sample for b in blocks if b.reason] == [1006]
     assert len(blocks) == len(found)

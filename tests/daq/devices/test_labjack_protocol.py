@@ -19,8 +19,9 @@ from daq.devices.labjack.packets import (
     encode_response,
 )
 from daq.devices.labjack.stream import StreamDecoder
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, HostTime
+from daq.protocols.block import Block, BlockFlag, DeviceItem, Event
 from daq.protocols.errors import RemoteProtocolError
+from tests.daq.devices.found import at, blocks_of, events_of, indices
 
 S = 1_000_000_000
 RATE = 1000.0
@@ -28,10 +29,6 @@ TICKS = 40_000
 TIMERS = list(stream.TIMER_ADDRESSES)
 SENSORS = {"A": [0, 2, 4], "B": [6]}
 SCAN_LIST = [*TIMERS, 0, 2, 4, 6]
-
-
-def at(seconds: float) -> HostTime:
-    return HostTime(round(seconds * S), 0)
 
 
 def scans(first: int, n: int, *, timed: bool = True, timer: int = 0) -> NDArray[np.uint16]:
@@ -61,13 +58,9 @@ def decoder(*, timed: bool = True) -> StreamDecoder:
 
 def of(sensor: str, found: Iterable[DeviceItem]) -> tuple[NDArray[Any], list[Block], list[Event]]:
     found = list(found)
-    blocks = [b for b in found if isinstance(b, Block) and b.sensor == sensor]
+    blocks = blocks_of(found, sensor)
     counts = np.concatenate([b.counts for b in blocks]) if blocks else np.empty((0, 3))
-    return counts, blocks, [e for e in found if isinstance(e, Event)]
-
-
-def indices(blocks: list[Block]) -> list[int]:
-    return [i for b in blocks for i in range(b.first_sample, b.end_sample)]
+    return counts, blocks, events_of(found)
 
 
 def test_packet_of_the_datasheet() -> None:
@@ -349,11 +342,10 @@ def test_a_packet_number_that_contradicts_host_time_is_ignored(timed: bool) -> N
     found: list[DeviceItem] = []
     for k, packet in enumerate([*sent[:10], sent[9], *sent[10:20], bytes(wrong), *sent[21:]]):
         found += one.receive(packet, at(k * 10 / RATE))
-    blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]
+    blocks = blocks_of(found, "A")
     assert [b.first_sample for b in blocks] == [0, *(b.end_sample for b in blocks[:-1])]
     assert blocks[-1].end_sample == 400
-    events = [item.text for item in found if isinstance(item, Event)]
-    assert events == ["received a packet twice"]
+    assert [item.text for item in events_of(found)] == ["received a packet twice"]
 
 
 @pytest.mark.parametrize("timed", [True, False])
@@ -365,8 +357,7 @@ def test_a_packet_with_lost_bytes_does_not_shift_later_ones(timed: bool) -> None
     found: list[DeviceItem] = []
     for k, packet in enumerate([*sent[:5], cut, *sent[6:]]):
         found += one.receive(packet, at(k * 10 / RATE))
-    blocks = [item for item in found if isinstance(item, Block) and item.sensor == "A"]
-    starts = [block.first_sample for block in blocks]
+    starts = [block.first_sample for block in blocks_of(found, "A")]
     assert starts == [0, 10, 20, 30, 40, 50, *range(70, 200, 10)]  # the next one pays for it
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from daq.devices.modbus.registers_protocol import DataType, RegisterDecoder, RegisterMap
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import DeviceSettingError
+from tests.daq.devices.found import blocks_of, only
 
 MS = 1_000_000
 WITMOTION = RegisterMap.of({"preset": "witmotion"}, 3)
@@ -150,8 +151,7 @@ def decoder(rate: float = 100.0, **map_settings: object) -> RegisterDecoder:
 def test_without_a_device_time_the_instant_is_halfway() -> None:
     one = decoder(rate=8.0)  # two samples a block
     assert one.receive([5], host(100), host(104)) == []
-    (block,) = one.receive([6], host(220), host(230))
-    assert isinstance(block, Block)
+    block = only(Block, one.receive([6], host(220), host(230)))
     assert block.counts.tolist() == [[5], [6]]
     assert block.instants_ns is not None
     assert block.instants_ns.tolist() == [102 * MS, 225 * MS]
@@ -162,17 +162,13 @@ def test_collected_readings_keep_their_arrival() -> None:
     """Not when the device was given up: the length of a gap to the next session hangs on it."""
     one = decoder(rate=8.0)
     assert one.receive([5], host(100), host(104)) == []
-    (block,) = one.flush()
-    assert isinstance(block, Block)
-    assert block.received == host(104)
+    assert only(Block, one.flush()).received == host(104)
 
 
 def test_missing_readings_are_a_gap() -> None:
     one = decoder(rate=4.0)
-    (first,) = one.receive([1], host(0), host(0))
-    (later,) = one.receive([2], host(1000), host(1000))
-    assert isinstance(first, Block)
-    assert isinstance(later, Block)
+    first = only(Block, one.receive([1], host(0), host(0)))
+    later = only(Block, one.receive([2], host(1000), host(1000)))
     assert (first.first_sample, later.first_sample) == (0, 4)
     assert later.flags == BlockFlag.MISSING_ESTIMATED
     assert later.reason == "3 polls without a reading"
@@ -183,8 +179,7 @@ def test_a_repeated_reading_is_dropped() -> None:
     found = []
     for k, counter in enumerate([65534, 65534, 65535, 0]):
         found += one.receive([k, counter], host(60 * k), host(60 * k))
-    (block,) = found
-    assert isinstance(block, Block)
+    block = only(Block, found)
     assert block.counts.tolist() == [[0], [2], [3]]
     assert block.device_counter == 65534
 
@@ -196,10 +191,9 @@ def test_device_time_gives_the_instant_for_any_latency() -> None:
     for k in range(400):
         taken = 10.0 * k
         words = [(50_000 + 10 * k) >> 16, (50_000 + 10 * k) & 0xFFFF]
-        for item in one.receive([k, *words], host(taken), host(taken + latency[k])):
-            assert isinstance(item, Block)
-            assert item.instants_ns is not None
-            instants += item.instants_ns.tolist()
+        for block in blocks_of(one.receive([k, *words], host(taken), host(taken + latency[k]))):
+            assert block.instants_ns is not None
+            instants += block.instants_ns.tolist()
     errors = np.array(instants) / MS - 10.0 * np.arange(400) - latency.min()
     assert np.ptp(errors[25:]) < 0.5  # the latency itself spreads over 7 ms
     assert abs(errors[-1]) < 0.5
@@ -209,24 +203,20 @@ def test_a_device_time_that_jumps_restarts_the_clock() -> None:
     one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
     one.receive([0, 0, 100], host(0), host(0))
     found = one.receive([0, 0, 5000], host(250), host(250))
-    assert isinstance(found[0], Event)
-    assert found[0].kind == "reset"
-    assert isinstance(found[1], Block)
-    assert found[1].flags == BlockFlag.CLOCK_RESTART
+    assert only(Event, found[:1]).kind == "reset"
+    assert only(Block, found[1:]).flags == BlockFlag.CLOCK_RESTART
 
 
 def test_a_device_that_was_off_for_a_while_leaves_a_gap() -> None:
     """One of several slaves on a bus: the session goes on without it."""
     one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
     one.receive([0, 0, 5000], host(0), host(0))
-    _, block = one.receive([0, 0, 1], host(10_000), host(10_000))
-    assert isinstance(block, Block)
+    block = only(Block, one.receive([0, 0, 1], host(10_000), host(10_000))[1:])
     assert block.first_sample == 40
     assert block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
     assert block.reason == "39 polls without a reading"
 
 
 def test_the_ends_of_the_range_are_clipped() -> None:
-    (block,) = decoder(rate=1.0).receive([0x7FFF], host(0), host(0))
-    assert isinstance(block, Block)
-    assert BlockFlag.CLIPPED in block.flags
+    found = decoder(rate=1.0).receive([0x7FFF], host(0), host(0))
+    assert BlockFlag.CLIPPED in only(Block, found).flags

@@ -20,6 +20,7 @@ from daq.devices.seedlink.decoder import (
 from daq.devices.seedlink.packets import Packet, PacketFinder, Version, encode_packet
 from daq.protocols.block import Block, BlockFlag, Event, HostTime
 from daq.protocols.errors import RemoteProtocolError
+from tests.daq.devices.found import blocks_of, events_of
 
 RATE = 200
 N = 100
@@ -63,7 +64,7 @@ def at(seconds: float) -> HostTime:
 
 def check(found: list[Block | Event], *, gaps: int = 0) -> list[Block]:
     """See that blocks hold what was sent, each in its place; return them."""
-    blocks = [item for item in found if isinstance(item, Block)]
+    blocks = blocks_of(found)
     end = 0
     for block in blocks:
         assert block.first_sample >= end
@@ -200,7 +201,7 @@ def test_a_backlog_behind_a_hole_is_kept() -> None:
     found += receiver.receive(turn(1213), at(612))
     blocks = check(found, gaps=1)
     assert sum(block.n_samples for block in blocks) == (10 + 1201) * N
-    assert not [item for item in found if isinstance(item, Event)]
+    assert not events_of(found)
 
 
 def test_channels_received_one_after_another_are_joined() -> None:
@@ -233,8 +234,7 @@ def test_a_damaged_record_is_reported_and_skipped() -> None:
         if k == 5:
             line = line[: 8 + 64] + bytes(440) + line[512:]
         found += receiver.receive(line, at(k / 2))
-    kinds = [item.kind for item in found if isinstance(item, Event)]
-    assert kinds == ["checksum"]
+    assert [item.kind for item in events_of(found)] == ["checksum"]
     check(found, gaps=1)
 
 
@@ -244,8 +244,7 @@ def test_another_rate_and_other_streams_are_refused() -> None:
     for k in range(3):
         found += receiver.receive(turn(k), at(k / 2))
     found += receiver.receive(packet(3, 0, rate=100), at(2))
-    (event,) = (item for item in found if isinstance(item, Event))
+    (event,) = events_of(found)
     assert event.kind == "refused"
     assert "expected 200 Hz" in event.text
-    other = receiver.receive(packet(3, 0, station="OTHER"), at(2))
-    assert other == []
+    assert not receiver.receive(packet(3, 0, station="OTHER"), at(2))

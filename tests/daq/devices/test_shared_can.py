@@ -17,6 +17,7 @@ from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind
 from tests.daq.devices.can_peer import Peer
+from tests.daq.devices.found import blocks_of
 from tests.sensors import sensor_at
 from tests.waiting import limit, wait_until
 
@@ -62,7 +63,7 @@ async def session(
 
 def rows_of(found: list[DeviceItem], name: str) -> tuple[list[int], list[int]]:
     """Return the indices and ticks of all rows of a sensor."""
-    blocks = [b for b in found if isinstance(b, Block) and b.sensor == name]
+    blocks = blocks_of(found, name)
     assert all((b.counts[:, 1] == NODES[name]).all() for b in blocks)
     index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
     return index, [int(tick) for b in blocks for tick in b.counts[:, 0]]
@@ -92,7 +93,7 @@ async def test_a_node_that_restarts_is_started_again_and_costs_nobody(name: str,
     missing = set(range(ticks[0], ticks[-1] + 1)) - set(ticks)
     assert missing == set(range(min(missing), max(missing) + 1))  # one gap
     assert len(missing) >= away
-    (again,) = [b for b in found if isinstance(b, Block) and b.sensor == name and b.reason]
+    (again,) = [b for b in blocks_of(found) if b.sensor == name and b.reason]
     assert again.flags & BlockFlag.CLOCK_RESTART
     assert again.flags & BlockFlag.MISSING_ESTIMATED
     kinds = [e.kind for e in found if isinstance(e, Event) and e.sensor == name]

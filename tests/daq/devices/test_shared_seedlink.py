@@ -21,7 +21,8 @@ from daq.devices.seedlink import driver
 from daq.devices.seedlink.packets import PacketFinder
 from daq.errors import NotConnectedError, WrongDeviceError
 from daq.host_clock import HostClock, SystemClock
-from daq.protocols.block import Block, DeviceItem, Event, EventKind
+from daq.protocols.block import Block, DeviceItem, EventKind
+from tests.daq.devices.found import blocks_of, events_of, indices
 from tests.daq.devices.seedlink_peer import PER_RECORD, RATE, Server, record, value
 from tests.sensors import sensor_at
 from tests.waiting import limit, wait_until
@@ -67,10 +68,9 @@ class Reader:
 
     def check(self, name: str) -> None:
         """See that rows of a sensor are one stretch, each what the server made."""
-        blocks = [b for b in self.items if isinstance(b, Block) and b.sensor == name]
+        blocks = blocks_of(self.items, name)
         counts = np.concatenate([b.counts[:, 0] for b in blocks]).tolist()
-        index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
-        assert index == list(range(len(index)))
+        assert indices(blocks) == list(range(len(counts)))
         station = NAMES.index(name)
         begin = next(k for k in range(100_003) if value(station, k) == counts[0])
         assert counts == [value(station, begin + k) for k in range(len(counts))]
@@ -91,8 +91,7 @@ async def test_a_refused_station_costs_the_others_nothing_and_comes_back(
         assert reader.rows["BBB"] == 0
         server.refuses = set()
         await reader.until(server, AAA=400, BBB=400, CCC=400)
-        kinds = [e.kind for e in reader.items if isinstance(e, Event)]
-        assert kinds == [EventKind.CONNECTED]
+        assert [e.kind for e in events_of(reader.items)] == [EventKind.CONNECTED]
         for name in NAMES:
             reader.check(name)
         server.refuses = {"CCC", "AAA"}  # a hang-up: the next session has BBB alone
@@ -199,8 +198,8 @@ async def test_a_station_of_another_rate_costs_the_others_nothing() -> None:
         await reader.until(server, AAA=200, BBB=200, CCC=200)
         for name in NAMES:
             reader.check(name)
-        kinds = [(e.sensor, e.kind) for e in reader.items if isinstance(e, Event)]
-        assert kinds == [("BBB", EventKind.REFUSED)]
+        told = [(e.sensor, e.kind) for e in events_of(reader.items)]
+        assert told == [("BBB", EventKind.REFUSED)]
         await _close(task, stack)
 
 

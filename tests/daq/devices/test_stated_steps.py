@@ -16,6 +16,7 @@ from daq.devices.guralp.decoders import ScreamDecoder
 from daq.devices.seedlink.decoder import SeedLinkDecoder, StreamSelection
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recorder.sample_index import SampleIndexer
+from tests.daq.devices.found import blocks_of, events_of
 from tests.peers.digitizer import CODES, START, Digitizer, Sent, scream, seedlink
 
 STREAMS = ("DEMOZ2", "DEMON2", "DEMOE2")
@@ -52,7 +53,7 @@ def recorded(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], list[Block], list[Event]]:
     """Return the indices and rows that the recorder writes, the blocks, and the events."""
     indexer = SampleIndexer(100.0)
-    blocks = [each for each in found if isinstance(each, Block)]
+    blocks = blocks_of(found)
     index, rows = [], []
     for block in blocks:
         placed = indexer.place(block).block
@@ -60,7 +61,7 @@ def recorded(
         assert placed.n_samples == block.n_samples
         index.append(np.arange(placed.first_sample, placed.end_sample))
         rows.append(placed.counts)
-    events = [each for each in found if isinstance(each, Event)]
+    events = events_of(found)
     return np.concatenate(index), np.concatenate(rows), blocks, events
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from daq.devices.guralp import gcf
 from daq.devices.guralp.gcf import SampleBlock, SystemId
 from daq.protocols.block import Block, DeviceItem, Event, HostTime
+from tests.daq.devices.found import blocks_of, events_of
 
 S = 1_000_000_000
 START_NS = 1_795_219_200 * S
@@ -41,6 +42,6 @@ def expected(first: int, n: int) -> NDArray[np.int64]:
 
 
 def joined(found: Iterable[DeviceItem]) -> tuple[NDArray[Any], list[Block], list[Event]]:
-    blocks = [item for item in found if isinstance(item, Block)]
+    blocks = blocks_of(found)
     counts = np.concatenate([b.counts for b in blocks]) if blocks else np.empty((0, 3))
-    return counts, blocks, [item for item in found if isinstance(item, Event)]
+    return counts, blocks, events_of(found)

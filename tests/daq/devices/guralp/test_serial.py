@@ -18,6 +18,7 @@ from daq.devices.guralp import brp, gcf
 from daq.devices.guralp.decoders import SerialDecoder, Streams
 from daq.devices.guralp.gcf import SampleBlock, StatusBlock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, Reading
+from tests.daq.devices.found import blocks_of, events_of
 from tests.daq.devices.guralp.sample_blocks import (
     AT,
     RATE,
@@ -233,12 +234,10 @@ def test_assigned_streams_keep_all_blocks_and_others_are_reported() -> None:
         assert list(streams.receive(block, AT, awaiting=True)) == []
     assert streams.repeated
     found = list(streams.assign("A", STREAMS))
-    assert [i.text for i in found if isinstance(i, Event)] == [
-        "stream OTHRZ2 belongs to no sensor of this port"
-    ]
+    assert [i.text for i in events_of(found)] == ["stream OTHRZ2 belongs to no sensor of this port"]
     for block in sent[3 * len(names) :]:  # a block that was asked for again
         found += streams.receive(block, AT, awaiting=True)
-    blocks = [item for item in found if isinstance(item, Block)]
+    blocks = blocks_of(found)
     assert [(b.first_sample, b.reason) for b in blocks] == [
         (0, ""),
         (100, ""),

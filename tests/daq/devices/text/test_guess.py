@@ -14,6 +14,7 @@ from daq.devices.text.decoder import TextDecoder
 from daq.devices.text.format import TextFormat, nmea_checksum
 from daq.devices.text.guess import guess_settings
 from daq.protocols.block import Block, HostTime
+from tests.daq.devices.found import blocks_of
 
 ACC = [[-12, 40, 16384], [-13, 41, 16380], [-11, 39, 16388], [-10, 38, 16390]]
 
@@ -92,11 +93,11 @@ def test_guessed_settings_decode_their_rows(name: str) -> None:
     for k, row in enumerate(rows):
         found += decoder.receive(row.encode() + b"\r\n", HostTime(10**12 + k * 10**7, 0))
     assert all(isinstance(item, Block) for item in found), found
-    counts = np.concatenate([item.counts for item in found if isinstance(item, Block)])
+    counts = np.concatenate([item.counts for item in blocks_of(found)])
     scale = 10 if name == "decimal comma" else 1
     np.testing.assert_allclose(counts * scale, ACC)
     assert settings.get("whole", False) == (name != "decimal comma")
-    ends = [item.end_sample for item in found if isinstance(item, Block)]
+    ends = [item.end_sample for item in blocks_of(found)]
     assert ends[-1] == len(ACC)
 
 

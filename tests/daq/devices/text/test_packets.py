@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from daq.devices.text.decoder import TextDecoder
-from daq.devices.text.format import (
-    RASPBERRY_SHAKE,
-)
+from daq.devices.text.format import RASPBERRY_SHAKE
 from daq.protocols.block import Block, BlockFlag, DeviceItem
-from tests.daq.devices.text.text_formats import SHAKE, at, datacast, split
+from tests.daq.devices.found import at, blocks_of, only
+from tests.daq.devices.text.text_formats import SHAKE, datacast, split
 
 
 def test_raspberry_shake_packets_are_decoded() -> None:
@@ -18,8 +17,7 @@ def test_raspberry_shake_packets_are_decoded() -> None:
     counts = list(range(14168, 14193))
     packet = "{'EHZ', 1582315130.292, " + ", ".join(map(str, counts)) + "}"
     decoder = TextDecoder("A", RASPBERRY_SHAKE, sampling_rate=100.0)
-    (block,) = decoder.receive_datagram(packet.encode(), at(1))
-    assert isinstance(block, Block)
+    block = only(Block, decoder.receive_datagram(packet.encode(), at(1)))
     assert block.counts[:, 0].tolist() == counts
     assert block.counts.dtype == np.int32
     assert block.device_counter == 1_582_315_130_292_000_000
@@ -50,7 +48,7 @@ def test_a_lost_packet_of_one_channel_is_a_gap_of_all() -> None:
     kept = [i for i in range(500) if i // 25 not in (5, 10, 11, 12)]
     assert index == kept
     assert [row[0] for row in rows] == kept
-    flags = [b.flags for b in found if isinstance(b, Block) and b.reason]
+    flags = [b.flags for b in blocks_of(found) if b.reason]
     assert flags == [BlockFlag.DEVICE_UTC] * 2  # exact: the times are written to 1 ms
 
 

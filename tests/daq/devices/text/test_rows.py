@@ -11,28 +11,23 @@ from hypothesis import strategies as st
 
 from daq.devices.text import format as text_format
 from daq.devices.text.decoder import MAX_WAITING, TextDecoder
-from daq.devices.text.format import (
-    LILY,
-    TextFormat,
-    encode_fields,
-)
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, Reading
-from tests.daq.devices.text.text_formats import COUNTED, ROWS, SHAKE, at, datacast, split
+from daq.devices.text.format import LILY, TextFormat, encode_fields
+from daq.protocols.block import BlockFlag, DeviceItem, Event, Reading
+from tests.daq.devices.found import at, blocks_of, only
+from tests.daq.devices.text.text_formats import COUNTED, ROWS, SHAKE, datacast, split
 
 
 @pytest.mark.parametrize("step", [1, 5, 1000])
 def test_rows_cut_anywhere_are_decoded(step: int) -> None:
     line = b"1,2,3\r\n 4.5 , -5e1,6\n\n7,8,9\n10,1"
     decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
-    found = [
-        x for i in range(0, len(line), step) for x in decoder.receive(line[i : i + step], at(1))
-    ]
+    pieces = (line[i : i + step] for i in range(0, len(line), step))
+    found = [item for piece in pieces for item in decoder.receive(piece, at(1))]
     index, rows, events = split(found)
     assert index == [0, 1, 2]
     assert rows == [[1, 2, 3], [4.5, -50, 6], [7, 8, 9]]
     assert not events
-    first = found[0]
-    assert isinstance(first, Block)
+    first = blocks_of(found)[0]
     assert first.flags == BlockFlag.CLOCK_RESTART
     assert first.counts.dtype == np.float64
 
@@ -52,16 +47,13 @@ def test_lily_rows_are_decoded() -> None:
     for second in (0, 1, 2, 6, 7):
         found += decoder.receive(line.format(second).encode(), at(second))
     found += decoder.receive(b"*9900XYC-OFF\r\n", at(8))
-    readings = [item for item in found if isinstance(item, Reading)]
-    stated = [(each.quantity, each.value) for each in readings]
+    stated = [(each.quantity, each.value) for each in found if isinstance(each, Reading)]
     assert stated == [("temperature", 26.01), ("supply", 11.96)]  # in one minute
-    found = [item for item in found if not isinstance(item, Reading)]
     index, rows, events = split(found)
     assert index == [0, 1, 2, 6, 7]
     assert rows == [[-236.026, 25.666]] * 5
     assert not events
-    gap = found[3]
-    assert isinstance(gap, Block)
+    gap = blocks_of(found)[3]
     assert (gap.reason, gap.flags) == ("time step", BlockFlag.MISSING_ESTIMATED)
     assert gap.device_counter == 1_372_116_126 * 10**9  # 2013-06-24T23:22:06Z
 
@@ -76,7 +68,7 @@ def test_a_counter_makes_gaps_exact() -> None:
     kept = [i for i in range(600) if not 300 <= i < 400 and i != 7]
     assert index == kept
     assert [row[0] for row in rows] == kept
-    assert {b.reason for b in found if isinstance(b, Block)} == {"", "counter"}
+    assert {b.reason for b in blocks_of(found)} == {"", "counter"}
 
 
 def test_unreadable_rows_are_counted() -> None:
@@ -160,9 +152,7 @@ def test_decoding_continues_after_any_bytes(pieces: list[bytes], format_: TextFo
 
 def test_memory_stays_bounded() -> None:
     decoder = TextDecoder("A", ROWS, sampling_rate=10.0)
-    found = [x for _ in range(50) for x in decoder.receive(b"1," * 20_000, at(0))]
-    (event,) = found
-    assert isinstance(event, Event)
+    event = only(Event, [x for _ in range(50) for x in decoder.receive(b"1," * 20_000, at(0))])
     assert "without the terminator '\\n': dropped (1 so far)" in event.text
     assert len(decoder._finder._buffer) <= text_format.MAX_MESSAGE  # noqa: SLF001 -- the claim
     index, rows, events = split(decoder.receive(b"1\n1,2,3\n", at(0)))

@@ -19,6 +19,7 @@ from daq.devices.text.format import RASPBERRY_SHAKE, TextFormat
 from daq.errors import NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind, HostTime
+from tests.daq.devices.found import blocks_of, events_of
 from tests.peers.text_logger import CHANNELS, UNIX, TextLogger
 from tests.sensors import sensor_at
 from tests.tcp import served
@@ -51,7 +52,7 @@ def check(
     found: list[DeviceItem], logger: TextLogger, *, n_lost: int = 0
 ) -> tuple[list[Block], list[Event]]:
     """See that every row is recorded once, with its index up to estimated gaps."""
-    blocks = [each for each in found if isinstance(each, Block)]
+    blocks = blocks_of(found)
     index = np.concatenate([np.arange(b.first_sample, b.end_sample) for b in blocks])
     rows = np.concatenate([b.counts for b in blocks])
     known = {tuple(row): n for n, row in enumerate(logger.samples.tolist())}
@@ -61,7 +62,7 @@ def check(
     estimated = [b.first_sample for b in blocks if BlockFlag.MISSING_ESTIMATED in b.flags]
     sure = index < min(estimated, default=index[-1] + 1)
     assert np.array_equal(index[sure], true[sure])
-    return blocks, [each for each in found if isinstance(each, Event)]
+    return blocks, events_of(found)
 
 
 @pytest.mark.parametrize("size", [-3600.0, -0.02, 0.02, 0.3])

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 
 from daq.devices.text.decoder import TextDecoder
-from daq.devices.text.format import (
-    LILY,
-    TextFormat,
-    decode_time,
-    encode_time,
-)
-from daq.protocols.block import Block, BlockFlag, DeviceItem
-from tests.daq.devices.text.text_formats import TIMED, at, split
+from daq.devices.text.format import LILY, TextFormat, decode_time, encode_time
+from daq.protocols.block import BlockFlag, DeviceItem
+from tests.daq.devices.found import at, blocks_of
+from tests.daq.devices.text.text_formats import TIMED, split
 
 
 def rows_at(times: list[float], arrivals: list[float], rate: float) -> list[DeviceItem]:
@@ -38,7 +34,7 @@ def test_rows_are_placed_by_their_time() -> None:
     kept = [i for i in range(300) if not 50 <= i < 57 and not 100 <= i < 200]
     assert index == kept
     assert [row[0] for row in rows_] == kept
-    assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in found if isinstance(b, Block))
+    assert not any(b.flags & BlockFlag.MISSING_ESTIMATED for b in blocks_of(found))
     assert {e.kind for e in events} == {"status"}
     assert events[-1].text.endswith("(9 so far)")
 
@@ -70,7 +66,7 @@ def test_one_time_may_belong_to_many_rows(written: str) -> None:
     assert not events
     by_index = {row[0] - 103: k for k, row in zip(index, rows, strict=True)}
     assert all(k == sent for sent, k in by_index.items() if not 215 - 103 <= sent < 240 - 103)
-    gaps = [b for b in found if isinstance(b, Block) and b.reason]
+    gaps = [b for b in blocks_of(found) if b.reason]
     assert all(b.flags & BlockFlag.MISSING_ESTIMATED for b in gaps)
 
 
@@ -124,8 +120,7 @@ def test_one_damaged_time_is_one_row_lost() -> None:
     times = [10_000 + i / 10 for i in range(50)]
     for wrong in (90_000.0, 5.0, 10_009.0):
         damaged = [*times[:20], wrong, *times[21:]]
-        found = rows_at(damaged, [t + 0.05 for t in times], 10.0)
-        index, _, events = split(found)
+        index, _, events = split(rows_at(damaged, [t + 0.05 for t in times], 10.0))
         assert index == [i for i in range(50) if i != 20]
         assert [e.kind for e in events] == ["checksum"]
         assert "(1 unreadable so far)" in events[0].text
@@ -139,7 +134,7 @@ def test_a_set_clock_is_a_reset_that_drops_nothing(step: float) -> None:
     index, rows, events = split(found)
     assert index == [row[0] for row in rows] == list(range(100))
     assert [e.text for e in events if e.kind == "reset"] == ["the device's clock was set"]
-    (block,) = [b for b in found[1:] if isinstance(b, Block) and b.flags]
+    (block,) = [b for b in blocks_of(found[1:]) if b.flags]
     assert block.flags & BlockFlag.CLOCK_RESTART
 
 

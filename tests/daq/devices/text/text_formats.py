@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from daq.devices.text.format import (
-    TextFormat,
-    encode_fields,
-)
-from daq.protocols.block import Block, DeviceItem, Event, HostTime
+from daq.devices.text.format import TextFormat, encode_fields
+from daq.protocols.block import DeviceItem, Event
+from tests.daq.devices.found import blocks_of, events_of, indices
 
 ROWS = TextFormat(columns=(0, 1, 2))
 TIMED = TextFormat(columns=(1,), time_column=0)
@@ -21,15 +19,10 @@ SHAKE = TextFormat(
 )
 
 
-def at(seconds: float) -> HostTime:
-    return HostTime(round(seconds * 1e9), 0)
-
-
 def split(found: list[DeviceItem]) -> tuple[list[int], list[list[float]], list[Event]]:
-    blocks = [b for b in found if isinstance(b, Block)]
-    index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
+    blocks = blocks_of(found)
     rows = [row for b in blocks for row in b.counts.tolist()]
-    return index, rows, [e for e in found if isinstance(e, Event)]
+    return indices(blocks), rows, events_of(found)
 
 
 def datacast(channel: str, packet: int, *, ahead: float = 0.0) -> bytes:
