@@ -11,7 +11,7 @@ get stations. The fault ``reset`` restarts the server with an empty ring and seq
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from fractions import Fraction
 from pathlib import Path
@@ -19,13 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.devices.seedlink.decoder import WaveRecord, encode_log, encode_record
-from daq.devices.seedlink.packets import (
-    LINE_END,
-    WRAP,
-    Packet,
-    Version,
-    encode_packet,
-)
+from daq.devices.seedlink.packets import LINE_END, WRAP, Packet, Version, encode_packet
 from sim_devices.devices.interface import NEVER, DeviceSpec, Endpoint, Line, Samples, Source, whole
 
 RECORD_SAMPLES = 100
@@ -69,6 +63,9 @@ class SimulatedStation:
         count = int(settings.get("first_count", 0))  # of the fault `wrap`, as of a 16-bit counter
         n_left = (65536 - count) // RECORD_SAMPLES * self.n_channels if count else WRAP
         self._first_sequence = WRAP - n_left + 1
+        self.next: int | None = None
+        """Index of the next packet to the client; None if it has not requested the station."""
+        self.selectors: list[str] = []
 
     @property
     def n_channels(self) -> int:
@@ -121,10 +118,20 @@ class SimulatedStation:
         sequence = index - self.began * self.n_channels + self._first_sequence
         return Packet(sequence, payload, f"{self.network}_{self.station}")
 
-    def is_selected(self, index: int, selectors: Sequence[str]) -> bool:
-        """Return whether a packet's channel is selected."""
+    def take(self, now: float) -> Iterator[Packet]:
+        """Yield the complete packets of the selected channels."""
+        if self.next is None:
+            return
+        begin = max(self.next, self.oldest(now) * self.n_channels)
+        self.next = max(begin, self.turn_at(now) * self.n_channels)
+        for index in range(begin, self.next):
+            packet = self.packet(index)
+            if packet is not None and self._is_selected(index):
+                yield packet
+
+    def _is_selected(self, index: int) -> bool:
         code = self.channels[index % self.n_channels]
-        wanted = [selector.replace("_", "") for selector in selectors]
+        wanted = [selector.replace("_", "") for selector in self.selectors]
         return not wanted or any(
             fnmatchcase(code, one[-3:]) and fnmatchcase(self._location, one[:-3] or "*")
             for one in wanted
@@ -148,17 +155,16 @@ class SeedLinkServer(Endpoint):
         self._received = b""
         self._version: Version = 3
         self._chosen: SimulatedStation | None = None
-        self._selectors: dict[int, list[str]] = {}
-        self._next: dict[int, int] = {}
         self._sends = False
+        for station in self._stations:
+            station.next, station.selectors = None, []
 
     def reset(self, now: float) -> None:
         """Restart with an empty ring."""
         for station in self._stations:
             station.began = station.turn_at(now)
-            key = id(station)
-            if key in self._next:
-                self._next[key] = station.began * station.n_channels
+            if station.next is not None:
+                station.next = station.began * station.n_channels
 
     def receive(self, received: bytes, now: float) -> Sequence[bytes]:
         """Process commands; return the replies."""
@@ -176,11 +182,8 @@ class SeedLinkServer(Endpoint):
             return [(self._hello + "\r\nhuddle\r\n").encode()]
         if command == "INFO":
             return [self._info()]
-        if command == "END":
-            self._sends = True
-            return []
-        if command == "BYE":
-            self._sends = False
+        if command in {"END", "BYE"}:
+            self._sends = command == "END"
             return []
         return [self._configure(command, rest, now) + LINE_END]
 
@@ -206,13 +209,12 @@ class SeedLinkServer(Endpoint):
             return self._chosen is not None
         if self._chosen is None:
             return command in {"BATCH", "CAPABILITIES", "USERAGENT"}
-        key = id(self._chosen)
         if command == "SELECT" and rest:
-            self._selectors.setdefault(key, []).append(rest[0])
+            self._chosen.selectors.append(rest[0])
             return True
         if command == "DATA":
             sequence = int(rest[0], 10 if self._version == 4 else 16) if rest else None
-            self._next[key] = self._chosen.start(sequence, now, self._version)
+            self._chosen.next = self._chosen.start(sequence, now, self._version)
             return True
         return False
 
@@ -224,33 +226,15 @@ class SeedLinkServer(Endpoint):
 
     def due(self, now: float) -> Sequence[bytes]:
         """Return the complete packets."""
-        sent: list[bytes] = []
-        if not self._sends:
-            return sent
-        for station in self._stations:
-            key = id(station)
-            if key not in self._next:
-                continue
-            index = max(self._next[key], station.oldest(now) * station.n_channels)
-            end = station.turn_at(now) * station.n_channels
-            while index < end:
-                packet = station.packet(index)
-                if packet is not None and station.is_selected(index, self._selectors.get(key, [])):
-                    sent.append(encode_packet(packet, self._version))
-                index += 1
-            self._next[key] = index
-        return sent
+        sent = [p for s in self._stations for p in s.take(now)] if self._sends else []
+        return [encode_packet(packet, self._version) for packet in sent]
 
     def next_due(self) -> float:
         """Return the world time at which the next packet is complete."""
         if not self._sends:
             return NEVER
-        times = (
-            station.due(self._next[id(station)] // station.n_channels)
-            for station in self._stations
-            if id(station) in self._next
-        )
-        return min(times, default=NEVER)
+        requested = ((s, s.next // s.n_channels) for s in self._stations if s.next is not None)
+        return min((station.due(turn) for station, turn in requested), default=NEVER)
 
 
 def create(device: DeviceSpec, source: Source) -> list[Line]:
