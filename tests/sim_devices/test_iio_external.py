@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.registry import driver_type
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, Reading
 from sim_devices.devices.iio import Iiod
 from sim_devices.devices.interface import Source
 from sim_devices.server.serve import device_spec
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, scenario
 from tests.tcp import served
 from tests.waiting import limit, wait_until
@@ -134,9 +133,8 @@ async def test_pylibiio_reads_every_scan() -> None:
 @pytest.mark.skipif(IIOD is None, reason="iiod is not installed")
 async def test_a_real_iiod_serves_our_driver() -> None:
     driver, found = driver_type("iio"), list[object]()
-    channels = tuple(Channel(name=axis, sensitivity=1e6) for axis in "xyz")
     async with serving() as uri, asyncio.timeout(limit()), _iiod(uri) as port:
-        sensor = Sensor(name="A", driver="iio", port=port, sampling_rate=RATE, channels=channels)
+        sensor = sensor_at(port, "iio", rate=RATE)
         for _ in range(2):  # the buffer is free again after a session
             found.clear()
             async with driver.open([sensor], SystemClock()) as session:

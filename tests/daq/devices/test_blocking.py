@@ -10,23 +10,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.blocking import BlockingSource, Samples
 from daq.errors import NoAnswerError, NotConnectedError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block, BlockFlag
+from tests.sensors import sensor_at
 from tests.waiting import limit
 
 
 def sensor(name: str, n_channels: int = 1) -> Sensor:
-    return Sensor(
-        name=name,
-        driver="epson",
-        port="COM1",
-        sampling_rate=100.0,
-        channels=tuple(Channel(name=f"c{k}", sensitivity=1.0) for k in range(n_channels)),
-    )
+    return sensor_at("COM1", "epson", name, rate=100.0, channels="xyz"[:n_channels])
 
 
 def rows(first: int, n: int = 10, n_channels: int = 1) -> np.ndarray[Any, Any]:

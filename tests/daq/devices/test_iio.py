@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daq.bench.channel import Channel
 from daq.bench.model import Sensor
 from daq.devices.iio.driver import IioSession
 from daq.devices.iio.protocol import IioDevice, ScanElement, ScanLayout
@@ -21,6 +20,7 @@ from sim_devices.server.launch import RunningDevice
 from tests.daq.devices.found import blocks_of, events_of, indices
 from tests.daq.devices.reading import reading, record
 from tests.devices import serving
+from tests.sensors import sensor_at
 from tests.sim_devices.simulated_bench import device, sensors, spec
 
 pytestmark = pytest.mark.devices
@@ -91,11 +91,9 @@ def decoded(
     Each buffer arrives with its last scan, or when the number of ``arrivals`` is sampled. The board
     states these times, or ``stated`` by the number of the scan.
     """
-    channels = (Channel(name="x", sensitivity=1.0),)
-    one = Sensor(name="A", driver="iio", port="iio://x", sampling_rate=RATE, channels=channels)
     session = IioSession(
         cast("Any", None),  # nothing is read
-        one,
+        sensor_at("iio://x", "iio", rate=RATE, channels="x"),
         IioDevice("iio:device0", "x", ELEMENTS, ()),
         ("accel_x",),
         information=(DeviceInformation("A", sampling_rate=RATE),),

@@ -15,9 +15,9 @@ from daq.devices.interface import DeviceInformation
 from daq.devices.registry import driver_type
 from daq.errors import NoAnswerError
 from daq.host_clock import SystemClock
-from daq.protocols.block import Block, BlockFlag, DeviceItem, Event, EventKind
+from daq.protocols.block import Block, BlockFlag, DeviceItem, EventKind
 from tests.daq.devices.can_peer import Peer
-from tests.daq.devices.found import blocks_of
+from tests.daq.devices.found import blocks_of, events_of, indices
 from tests.sensors import sensor_at
 from tests.waiting import limit, wait_until
 
@@ -65,8 +65,7 @@ def rows_of(found: list[DeviceItem], name: str) -> tuple[list[int], list[int]]:
     """Return the indices and ticks of all rows of a sensor."""
     blocks = blocks_of(found, name)
     assert all((b.counts[:, 1] == NODES[name]).all() for b in blocks)
-    index = [i for b in blocks for i in range(b.first_sample, b.end_sample)]
-    return index, [int(tick) for b in blocks for tick in b.counts[:, 0]]
+    return indices(blocks), [int(tick) for b in blocks for tick in b.counts[:, 0]]
 
 
 def check_rows(found: list[DeviceItem], *, complete: set[str]) -> None:
@@ -93,10 +92,10 @@ async def test_a_node_that_restarts_is_started_again_and_costs_nobody(name: str,
     missing = set(range(ticks[0], ticks[-1] + 1)) - set(ticks)
     assert missing == set(range(min(missing), max(missing) + 1))  # one gap
     assert len(missing) >= away
-    (again,) = [b for b in blocks_of(found) if b.sensor == name and b.reason]
+    (again,) = [b for b in blocks_of(found, name) if b.reason]
     assert again.flags & BlockFlag.CLOCK_RESTART
     assert again.flags & BlockFlag.MISSING_ESTIMATED
-    kinds = [e.kind for e in found if isinstance(e, Event) and e.sensor == name]
+    kinds = [e.kind for e in events_of(found) if e.sensor == name]
     assert kinds == [EventKind.STALLED, EventKind.CONNECTED]
 
 

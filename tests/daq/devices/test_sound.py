@@ -41,16 +41,14 @@ READ = """
 import asyncio, contextlib, json, sys
 import numpy as np
 from daq.devices.registry import driver_type
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.errors import HuddleError
 from daq.host_clock import SystemClock
 from daq.protocols.block import Block
+from tests.sensors import sensor_at
 
 
 def sensor(name, port, **settings):
-    return Sensor(name=name, driver="sound", port=port, sampling_rate=8000.0, settings=settings,
-                  channels=tuple(Channel(name=c, sensitivity=1.0) for c in "xy"))
+    return sensor_at(port, "sound", name, rate=8000.0, channels="xy", settings=settings)
 
 
 async def main(port, n):

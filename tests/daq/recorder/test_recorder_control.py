@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.errors import (
-    NotConnectedError,
-)
+from daq.errors import NotConnectedError
 from daq.recording.control import ControlRefusedError, ask
 from daq.recording.reader import Recording, control_address
 from tests.daq.recorder.test_recorder import Run
@@ -70,10 +68,8 @@ async def test_commands_of_the_control_port_are_executed(tmp_path: Path) -> None
         assert (await task).closed
     with pytest.raises(NotConnectedError, match="no recorder is writing it"):
         ask(run.path, "stop")
-    with Recording.open(run.path) as recording:
-        marks = [event.text for event in recording.events if event.kind == "mark"]
-        assert marks == ["a door slammed"]
-        assert recording.events[-1].text == "stopped by command"
+    assert run.texts("mark") == ["a door slammed"]
+    assert run.texts()[-1] == "stopped by command"
 
 
 async def test_samples_that_were_not_counted_are_recorded_once(tmp_path: Path) -> None:

@@ -76,9 +76,7 @@ async def test_another_device_on_the_port_is_refused(tmp_path: Path) -> None:
             await device.opened.wait()
         device.serial_number = "1"
         await run.sent("a", 0, 100, 200)
-    with Recording.open(run.path) as recording:
-        refused = [e.text for e in recording.events if e.kind == "refused"]
-        assert refused == ["sensor 'a' on a: expected serial number '1', got '2'"]
+    assert run.texts("refused") == ["sensor 'a' on a: expected serial number '1', got '2'"]
 
 
 async def test_a_wrong_rate_is_refused_at_the_start(tmp_path: Path) -> None:

@@ -30,13 +30,19 @@ def block(
     return Block("a", first, counts, at(seconds), counter, flags, reason)
 
 
+def placed_by(continuity: SampleIndexer, sent: Block) -> tuple[Block, Gap | None]:
+    """Place a block that is recorded; return it, and the gap before it."""
+    placed = continuity.place(sent)
+    assert placed.block is not None
+    return placed.block, placed.gap
+
+
 def test_within_a_session_a_jump_is_a_gap_of_that_length() -> None:
     continuity = SampleIndexer(RATE)
     assert continuity.place(block(0, 10, 0.1)).gap is None
-    placed = continuity.place(block(15, 10, 0.25, reason="checksum"))
-    assert placed.gap == Gap(10, 5, "checksum", estimated=False)
-    assert placed.block is not None
-    assert placed.block.first_sample == 15
+    placed, gap = placed_by(continuity, block(15, 10, 0.25, reason="checksum"))
+    assert gap == Gap(10, 5, "checksum", estimated=False)
+    assert placed.first_sample == 15
     assert continuity.next_sample == 25
 
 
@@ -57,25 +63,21 @@ def test_a_new_session_is_placed_by_host_time() -> None:
     continuity.place(block(0, 10, 0.1))
     continuity.new_session("disconnected")
     # Its last sample came 5.2 s after the last one before: 520 samples on, 10 of them here.
-    placed = continuity.place(block(0, 10, 5.3))
-    assert placed.gap == Gap(10, 510, "disconnected", estimated=True)
-    assert placed.block is not None
-    assert placed.block.first_sample == 520
-    assert placed.block.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
-    follows = continuity.place(block(10, 10, 5.4))
-    assert follows.gap is None
-    assert follows.block is not None
-    assert follows.block.first_sample == 530
+    placed, gap = placed_by(continuity, block(0, 10, 5.3))
+    assert gap == Gap(10, 510, "disconnected", estimated=True)
+    assert placed.first_sample == 520
+    assert placed.flags == BlockFlag.CLOCK_RESTART | BlockFlag.MISSING_ESTIMATED
+    follows, gap = placed_by(continuity, block(10, 10, 5.4))
+    assert (gap, follows.first_sample) == (None, 530)
 
 
 def test_that_nothing_is_missing_before_a_new_session_is_an_estimate() -> None:
     continuity = SampleIndexer(RATE)
     continuity.place(block(0, 10, 0.1))
     continuity.new_session("disconnected")
-    placed = continuity.place(block(0, 10, 0.2))
-    assert (placed.gap, placed.block and placed.block.first_sample) == (None, 10)
-    assert placed.block is not None
-    assert BlockFlag.MISSING_ESTIMATED in placed.block.flags
+    placed, gap = placed_by(continuity, block(0, 10, 0.2))
+    assert (gap, placed.first_sample) == (None, 10)
+    assert BlockFlag.MISSING_ESTIMATED in placed.flags
 
 
 def test_a_resumed_session_continues_the_index_of_the_last() -> None:
@@ -84,12 +86,11 @@ def test_a_resumed_session_continues_the_index_of_the_last() -> None:
     continuity.new_session("refused")
     continuity.place(block(0, 10, 1.1))
     continuity.resume("disconnected")
-    placed = continuity.place(block(510, 10, 99.0))
-    assert placed.gap == Gap(110, 500, "disconnected", estimated=False)
-    assert placed.block is not None
-    assert not placed.block.flags
-    placed = continuity.place(block(530, 10, 99.2))
-    assert placed.gap == Gap(620, 10, "lost", estimated=False)
+    placed, gap = placed_by(continuity, block(510, 10, 99.0))
+    assert gap == Gap(110, 500, "disconnected", estimated=False)
+    assert not placed.flags
+    _, gap = placed_by(continuity, block(530, 10, 99.2))
+    assert gap == Gap(620, 10, "lost", estimated=False)
 
 
 def test_device_time_makes_the_gap_exact() -> None:
@@ -109,10 +110,9 @@ def test_samples_sent_again_after_a_break_are_recorded_once() -> None:
     continuity.new_session("disconnected")
     again = continuity.place(block(0, 100, 5.0, flags=utc, counter=10**18 + 10**9))
     assert (again.block, again.gap, again.repeated) == (None, None, 100)
-    follows = continuity.place(block(100, 150, 5.1, flags=utc, counter=10**18 + 2 * 10**9))
-    assert follows.gap is None
-    assert follows.block is not None
-    assert follows.block.first_sample == 200
+    sent = block(100, 150, 5.1, flags=utc, counter=10**18 + 2 * 10**9)
+    follows, gap = placed_by(continuity, sent)
+    assert (gap, follows.first_sample) == (None, 200)
 
 
 @pytest.mark.parametrize("date", [0, 3 * 10**18])
@@ -135,10 +135,8 @@ def test_a_reset_within_a_session_is_placed_by_host_time() -> None:
 def test_a_session_that_was_lost_without_a_sample_changes_nothing() -> None:
     continuity = SampleIndexer(RATE)
     continuity.new_session("disconnected")
-    placed = continuity.place(block(0, 10, 9.0))
-    assert placed.gap is None
-    assert placed.block is not None
-    assert placed.block.first_sample == 0
+    placed, gap = placed_by(continuity, block(0, 10, 9.0))
+    assert (gap, placed.first_sample) == (None, 0)
 
 
 def test_samples_missing_at_the_end_are_a_gap() -> None:

@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.bench.channel import Channel
-from daq.bench.model import Sensor
 from daq.devices.epson import commands
 from daq.devices.epson.driver import Configuration, Device, EpsonSession, EpsonSettings
 from daq.devices.interface import DeviceInformation
@@ -28,6 +26,7 @@ from daq.transport import address
 from daq.transport.address import host_and_port
 from daq.transport.byte_stream import ByteStream
 from daq.transport.ports import open_port
+from tests.sensors import sensor_at
 from tests.waiting import limit
 
 
@@ -214,8 +213,7 @@ async def test_a_terminal_with_a_limited_count_wakes_at_the_end_of_a_frame(
 
 async def test_reads_of_an_epson_return_to_the_ends_of_frames() -> None:
     """Else every block's time is late by most of a sample period, until the host is late once."""
-    channels = tuple(Channel(name=axis, sensitivity=1.0) for axis in "xyz")
-    sensor = Sensor(name="A", driver="epson", port="x", sampling_rate=50.0, channels=channels)
+    sensor = sensor_at("x", "epson", rate=50.0)
     configuration = Configuration.of(sensor, EpsonSettings())
     zeros = np.zeros(20, np.int32)
     sent = commands.encode_bursts(
