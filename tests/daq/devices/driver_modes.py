@@ -139,8 +139,7 @@ class Served:
         """Return what the device has sampled so far, due by the host clock of its reader."""
         driver = CASES[mode]["driver"]
         felt = np.clip(self._felt[name] + OFFSETS.get(driver, 0), *RANGES.get(driver, (None, None)))
-        world = WorldClock(self.world["epoch_ns"], self.world["speed"], paced_clock().now_ns)
-        now, host_now = world.now(), clock.now().monotonic_ns * 1e-9
+        now, host_now = world_clock(self.world).now(), clock.now().monotonic_ns * 1e-9
         since = (now - self._felt.times[name]) * speed / self.world["speed"]
         return Sent(felt, host_now - since)
 
@@ -178,11 +177,7 @@ class _Felt(dict[str, "NDArray[np.float64]"]):
         source = Source(world, described)
         if described.driver in {"guralp", "seedlink"}:  # on whole seconds of UTC
             source = source.disciplined(-described.utc_ns % 10**9 / 1e9)
-        end = (
-            WorldClock(self._world["epoch_ns"], self._world["speed"], paced_clock().now_ns).now()
-            + 1.0
-        )
-        n_samples = round(end * rate)
+        n_samples = round((world_clock(self._world).now() + 1.0) * rate)
         self[name] = source.counts(name, 0, n_samples)
         self.times[name] = source.times(name, 0, n_samples)
         return self[name]
