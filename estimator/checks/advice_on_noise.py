@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Seconds, Share
+from estimator.records import Hertz, Seconds, Share
 from estimator.wording import Words, few, listed, percent, several, time_of_day
 
 LARGE_FALL = -0.8
@@ -70,6 +70,23 @@ class SharedNoise(Advice):
             f"({', '.join(coherencies)} of the noise).{instead} {_effect(self, names)}",
             "Check what these channels have in common: digitizer, power supply, ground, cable, "
             "mount.",
+        )
+
+
+class LinesOfOne(Advice):
+    """One sensor has lines that no other has, such as hum: they are its noise."""
+
+    frequencies: tuple[Hertz, ...]
+
+    def _words(self, names: Names) -> Words:
+        each = [f"{frequency:.3g}" for frequency in self.frequencies]
+        who = names.list_sensors(self.sensors)
+        line = "a line" if len(each) == 1 else "lines"
+        return Words(
+            f"{who} alone has {line} at {few(each)} Hz: hum, or other interference",
+            f"{who} has {line} at {listed(each)} Hz that no other sensor has: its noise, such as "
+            "hum or another interference.",
+            f"Check cable, ground and power supply of {who}.",
         )
 
 

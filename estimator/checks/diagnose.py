@@ -6,7 +6,7 @@ orientation of the sensors, and the recommendations of section 5 of the paper.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
@@ -14,7 +14,12 @@ from itertools import combinations
 import numpy as np
 
 from estimator.checks.advice import Advice, Rank, Untested
-from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
+from estimator.checks.advice_on_noise import (
+    DisturbedSegments,
+    LinesOfOne,
+    NoiseChanges,
+    ResponseChanges,
+)
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.disturbed_segments import SegmentCourse
 from estimator.checks.noise_within import beside_matrices
@@ -287,7 +292,7 @@ def diagnose(
     between = HANN_HALF if neighbours is None else neighbours
     insides = _insides(frequency)
     model, untested = _test(tested, there, n_effective, len(csm))
-    model, widened = beside_matrices(
+    model, widened, lines = beside_matrices(
         model,
         part,
         frequency,
@@ -297,6 +302,7 @@ def diagnose(
         n_effective=n_effective,
         neighbours=between,
     )
+    tested = _without_lines(tested, lines)
     snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
     if isinstance(fit, Maximum):
         error = standard_error(fit, n_effective=n_effective)
@@ -354,8 +360,9 @@ def diagnose(
             inflation=1.0 if steady is None else steady.inflations,
         )
         if shared is not None:  # matrices explain what pairs would
-            explained = np.where(widened, 0.0, shared.explained)
-            shared = replace(shared, explained=explained).among(there.channels, sum(dims))
+            shared = replace(shared, explained=np.where(widened, 0.0, shared.explained)).among(
+                there.channels, sum(dims)
+            )
     responses = _responses(csm, given, frequency, there, vertical=vertical, coherence=canonical)
     return Diagnostics(
         frequency=frequency,
@@ -380,19 +387,38 @@ def diagnose(
             shared=shared,
             moved=left,
             further=(
-                ()
-                if steady is None
-                else tuple(
-                    changes(
+                *_lines(lines, frequency, there.sensors),
+                *(
+                    ()
+                    if steady is None
+                    else changes(
                         steady,
                         None if course is None else course.times,
                         np.repeat(np.arange(len(dims)), dims),
                     )
-                )
+                ),
             ),
         ),
         stability=steady,
     )
+
+
+def _without_lines(fit: Maximum | Untested, lines: IntArray) -> Maximum | Untested:
+    """Return a fit in which frequencies with lines of a sensor say nothing."""
+    if isinstance(fit, Untested) or not (lines >= 0).any():
+        return fit
+    return replace(fit, converged=fit.converged & (lines < 0))
+
+
+def _lines(sensor: IntArray, frequency: FloatArray, sensors: Sequence[int]) -> Iterator[LinesOfOne]:
+    """Yield what each sensor has alone at single frequencies, given by sensor or -1."""
+    for number in sorted({*sensor.tolist()} - {-1}):
+        own = np.flatnonzero(sensor == number)
+        middles = [each.mean() for each in np.split(own, np.flatnonzero(np.diff(own) > 1) + 1)]
+        at = np.interp(middles, np.arange(len(frequency)), frequency)
+        yield LinesOfOne(
+            rank=Rank.TO_KNOW, sensors=(sensors[number],), frequencies=tuple(at.tolist())
+        )
 
 
 def _insides(frequency: FloatArray) -> list[BoolArray]:

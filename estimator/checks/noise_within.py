@@ -19,6 +19,10 @@ ALIKE = 0.5
 others do not share: what clocks, gaps and waves that differ leave."""
 STEADY = 0.9
 """Mean of what channels share over its rms, from which it is that of one source."""
+LINE, LINES = 6, 0.1
+"""Frequencies of a band at most, or their share, of which lines of one sensor make it fail."""
+STANDS_OUT = 1e-6
+"""p value of a frequency below which it may be one of them."""
 LOOK = 16
 """Frequencies of a band at which sensors are tried first."""
 
@@ -33,11 +37,12 @@ def beside_matrices(
     n_factors: int,
     n_effective: float,
     neighbours: FloatArray,
-) -> tuple[ModelTest, BoolArray]:
+) -> tuple[ModelTest, BoolArray, IntArray]:
     """Return the test with the noise of one sensor as a matrix where that explains a failed band.
 
     Not of all sensors: motion that differs between three sensors fits matrices of all three. Also
-    returns whether it is such a test, in each of the bands `insides`.
+    returns whether it is such a test, in each of the bands `insides`; and the sensor of lines, such
+    as hum, which alone make a band fail, at each frequency: -1 elsewhere.
     """
     tests = [pool(model, inside, neighbours=neighbours) for inside in insides]
     rejected = rejected_below(tests)
@@ -50,8 +55,9 @@ def beside_matrices(
     widened = np.zeros(len(insides), np.bool_)
     found = [each.copy() for each in (model.statistic, model.degrees, model.p_value)]
     failed = [n for n, test in enumerate(tests if ones else ()) if test.p_value < rejected]
+    lines = np.full(len(frequency), -1)
     if not failed:
-        return model, widened
+        return model, widened, lines
     every = [np.flatnonzero(insides[number] & np.isfinite(model.statistic)) for number in failed]
     seen = [rows[:: -(-len(rows) // LOOK)] for rows in every]
     edges = np.cumsum([0, *map(len, seen)]).tolist()
@@ -63,6 +69,18 @@ def beside_matrices(
     for number, rows, look, some in zip(
         failed, every, seen, map(slice, edges, edges[1:]), strict=False
     ):
+        out = rows[model.p_value[rows] < STANDS_OUT]
+        if 0 < len(out) <= max(LINE, LINES * len(rows)):
+            others = insides[number].copy()
+            others[out] = False
+            of_each = [model_test(fits(out, each), n_effective=n_effective) for each in ones]
+            best = int(np.argmin([np.nansum(each.statistic) for each in of_each]))
+            both = pool(model, others, neighbours=neighbours), pool(of_each[best], out >= 0)
+            if min(each.p_value for each in both) >= rejected:
+                first = int(np.argmax(np.array(ones[best]) > 1))
+                lines[out] = np.searchsorted(np.cumsum(dims), first, side="right")
+                _put(found, of_each[best], out)
+                continue
         least = [np.nansum(each.discrepancy[some]) for each in looks]
         best = int(np.argmin(least))
         fit = looks[best].take(some) if len(look) == len(rows) else fits(rows, ones[best])
@@ -70,11 +88,13 @@ def beside_matrices(
         explained = pool(beside, rows >= 0, neighbours=neighbours).p_value >= CLEARLY * rejected
         if explained and _is_noise(fit, testable(part.block(rows), frequency[rows])):
             widened[number] = True
-            for each, values in zip(
-                found, (beside.statistic, beside.degrees, beside.p_value), strict=True
-            ):
-                each[rows] = values
-    return ModelTest(*found), widened
+            _put(found, beside, rows)
+    return ModelTest(*found), widened, lines
+
+
+def _put(found: list[FloatArray], test: ModelTest, rows: IntArray) -> None:
+    for each, values in zip(found, (test.statistic, test.degrees, test.p_value), strict=True):
+        each[rows] = values
 
 
 def _is_noise(fit: Maximum, matrix: ComplexArray) -> bool:

@@ -15,7 +15,7 @@ from estimator.checks.advice_on_model import (
     TooFewDimensions,
     WeakMotion,
 )
-from estimator.checks.advice_on_noise import ResponseChanges
+from estimator.checks.advice_on_noise import LinesOfOne, ResponseChanges, SharedNoise
 from estimator.checks.advice_on_sensors import (
     Delay,
     Gain,
@@ -425,3 +425,27 @@ def test_lists_are_accepted_like_arrays() -> None:
     array = diagnose(csm, FREQUENCY[:12], dims=THREE, n_effective=100)
     lists = diagnose(csm.tolist(), FREQUENCY[:12].tolist(), dims=THREE, n_effective=100)
     np.testing.assert_array_equal(lists.snr, array.snr)
+
+
+@pytest.mark.parametrize("hum", [30.0, 3000.0])  # below and above the motion
+def test_hum_of_one_sensor_is_its_noise_and_no_misfit(hum: float) -> None:
+    """It failed the model test of its band, and other sensors were said to share noise."""
+    turned = [Rotation.random(random_state=seed).as_matrix() for seed in range(3)]
+    csm = np.repeat(bench(*turned)[None], len(FREQUENCY), axis=0)
+    csm[60:63, 3:6, 3:6] += hum  # equal in all channels of the second
+    found = of(csm)
+    (lines,) = advice_of(LinesOfOne, found)
+    assert lines.sensors == (1,)
+    np.testing.assert_allclose(lines.frequencies, FREQUENCY[61:62])
+    assert not advice_of(ModelMisfit, found)
+    assert not advice_of(SharedNoise, found)
+
+
+def test_motion_that_differs_at_some_frequencies_is_no_line() -> None:
+    turned = [Rotation.random(random_state=seed).as_matrix() for seed in range(3)]
+    csm = np.repeat(bench(*turned)[None], len(FREQUENCY), axis=0)
+    felt = np.random.default_rng(2).standard_normal(9)
+    csm[60:63] += 30 * np.outer(felt, felt)
+    found = of(csm)
+    assert advice_of(ModelMisfit, found)
+    assert not advice_of(LinesOfOne, found)

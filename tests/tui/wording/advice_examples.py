@@ -15,6 +15,7 @@ from estimator.checks.advice_on_model import (
 )
 from estimator.checks.advice_on_noise import (
     DisturbedSegments,
+    LinesOfOne,
     NoiseChanges,
     ResponseChanges,
     SharedNoise,
@@ -127,6 +128,7 @@ UNEQUAL = UnequalResponses(
 EXAMPLES: tuple[Advice, ...] = (
     SHARED,
     replace(SHARED, sensors=(0,), channels=((0, 1),), coherencies=(0.1,), standard_errors=(0.01,)),
+    LinesOfOne(rank=Rank.TO_KNOW, sensors=(1,), frequencies=(16.7, 33.4)),
     DisturbedSegments(
         rank=Rank.DELAYS,
         sensors=(1,),
