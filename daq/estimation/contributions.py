@@ -53,11 +53,12 @@ MUCH_NONLINEAR = 0.05
 terms of other forms may be all of the rest."""
 NO_NOISE = 0.1
 """Share of the frequencies of a band with no noise, from which a channel has none for certain."""
-_THREE = 3  # sensors
+_TWO, _THREE = 2, 3  # sensors
 UNCERTAIN = 0.3
 """Share of what squares and cubes explain by which it is uncertain."""
 MOST_FREQUENCIES = 0.5
-"""Share of the frequencies of a band without noise from which a motion, and no line, is felt."""
+"""Share of frequencies: of a band without noise, from which a motion, and no line, is felt; of all,
+from which what two sensors alone have in common is taken to be everywhere."""
 NOTHING_USEFUL = 1.0
 """Share of the noise by which a model that fails may be off, from which nothing is known."""
 
@@ -405,8 +406,8 @@ def shared_parts(snapshot: Snapshot) -> FloatArray:
 def by_two(snapshot: Snapshot) -> BoolArray:
     """Return where two sensors of one channel alone have something in common: motion, or noise.
 
-    Of motion that all feel, no pair has `ONLY_TWO` times the cross-spectrum of all others. Shape
-    (n_freqs, n_channels).
+    Of motion that all feel, no pair has `ONLY_TWO` times the cross-spectrum of all others. What the
+    same two have at most frequencies they may have at all. Shape (n_freqs, n_channels).
     """
     own, n = np.nan_to_num(snapshot.data_psd), snapshot.n_effective
     found = np.zeros(own.shape, np.bool_)
@@ -427,7 +428,8 @@ def by_two(snapshot: Snapshot) -> BoolArray:
     pair = least > ONLY_TWO**2 * most.max(axis=1)
     for at in (one[first], other[first]):
         found[rows[pair], at[pair]] = True
-    return found
+    most_of_all = found.mean(axis=0) > MOST_FREQUENCIES
+    return np.asarray(found | (most_of_all & (found.any(axis=0).sum() == _TWO)))
 
 
 @once

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
+
+from daq.estimation.contributions import by_two
 from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import Estimate
 from daq.results.facts.channels import facts_of_channels, facts_of_linearity, facts_of_rounding
@@ -16,6 +20,7 @@ from daq.results.facts.precision import facts_of_precision
 from daq.results.facts.recordings import facts_of_recordings
 from daq.results.facts.segments import facts_of_segments
 from estimator.checks.advice import Advice, Rank
+from estimator.checks.advice_on_noise import SharedNoise
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:
@@ -74,7 +79,7 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
     Those outside of the band asked for go by themselves: they must not hide what is inside.
     """
     kinds: dict[tuple[type[Advice], bool], list[Advice]] = {}
-    for each in snapshot.diagnostics.advice:
+    for each in map(partial(_or_two_alone, snapshot), snapshot.diagnostics.advice):
         kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
     ranks, names = list(Rank), snapshot.sensor_names
     for found in kinds.values():
@@ -92,3 +97,17 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
             findings=tuple(found),
             names=snapshot.names,
         )
+
+
+def _or_two_alone(snapshot: Snapshot, advice: Advice) -> Advice:
+    """Return advice on shared noise with two sensors that alone have something in common.
+
+    If that is noise, the model takes it for the motion, and the motion for noise that others share.
+    """
+    if not isinstance(advice, SharedNoise) or advice.band is None:
+        return advice
+    here = (snapshot.frequency >= advice.band[0]) & (snapshot.frequency <= advice.band[1])
+    alone = np.flatnonzero(by_two(snapshot)[here].any(axis=0)).tolist()
+    if len(alone) != 2 or (pair := (alone[0], alone[1])) in advice.channels + advice.alternatives:
+        return advice
+    return replace(advice, alternatives=(pair, *advice.alternatives))

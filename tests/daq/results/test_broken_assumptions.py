@@ -10,7 +10,9 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
+from daq.results.facts.fact import Finding
 from daq.results.result import Result
+from estimator.checks.advice_on_noise import SharedNoise
 
 RATE, N_SAMPLES = 100.0, 24_000
 SETTINGS = Settings(segment=2.0)
@@ -158,4 +160,8 @@ def test_what_two_sensors_alone_have_in_common_may_be_noise(shared: float) -> No
     assert held(snapshot, noise).mean() > 0.9
     of_two = by_two(snapshot).mean(axis=0)
     assert np.all(of_two[2:] == 0)
-    assert np.all(of_two[:2] > 0.6 if shared else of_two[:2] == 0)
+    assert np.all(of_two[:2] == (1 if shared else 0))
+    facts = [fact for fact in Result(snapshot, SETTINGS).facts if isinstance(fact, Finding)]
+    named = [each for fact in facts for each in fact.findings if isinstance(each, SharedNoise)]
+    assert bool(named) == bool(shared)
+    assert all((0, 1) in each.channels + each.alternatives for each in named)
