@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
-from daq.results.uncertainty_budget import Budget, Component, student_quantile
+from daq.results.uncertainty_budget import Budget, student_quantile
 from estimator.wording import signed, span
 from tui.page.table import Table
 
@@ -123,23 +123,15 @@ def sensitivity_table(found: Calibration, snapshot: Snapshot) -> Table:
     rows = []
     budgets = {(each.sensor, each.channel): each for each in found.whole_band("sensitivity")}
     for each in found.sensors:
-        name = snapshot.sensor_names[each.sensor]
+        name, turn = snapshot.sensor_names[each.sensor], each.angle_deg
         for number, channel in enumerate(channels_of(snapshot, each.sensor)):
             budget = budgets[name, channel]
-            rows.append(
-                (
-                    name,
-                    channel,
-                    with_error(budget.value, budget.expanded)
-                    + (" counts/unit" * budget.is_absolute),
-                    f"{budget.k:.2f}",
-                    _element(each.delay, number, k, 1e6),
-                    _element(each.skew, number, k, 1e6) if number else "0",
-                    angle(
-                        float(each.angle_deg.value[number]), float(each.angle_deg.error[number]), k
-                    ),
-                )
-            )
+            value = with_error(budget.value, budget.expanded)
+            delay = _element(each.delay, number, k, 1e6)
+            skew = _element(each.skew, number, k, 1e6) if number else "0"
+            turned = angle(float(turn.value[number]), float(turn.error[number]), k)
+            value += " counts/unit" * budget.is_absolute
+            rows.append((name, channel, value, f"{budget.k:.2f}", delay, skew, turned))
     return _table(header, rows)
 
 
@@ -176,10 +168,8 @@ def matrix_table(found: Calibration, snapshot: Snapshot) -> Table:
             snapshot.sensor_names[each.sensor],
             channel,
             *(
-                with_error(
-                    float(each.matrix.value[row, column]), k * float(each.matrix.error[row, column])
-                )
-                for column in range(len(reference))
+                with_error(float(value), k * float(error))
+                for value, error in zip(each.matrix.value[row], each.matrix.error[row], strict=True)
             ),
         )
         for each in found.sensors
@@ -192,30 +182,14 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
     """Return budgets as a table: a row for each channel, a column for each source."""
     sources = list(dict.fromkeys(each.source for budget in budgets for each in budget.components))
     types = {each.source: each.kind for budget in budgets for each in budget.components}
-    header = (
-        "sensor",
-        "channel",
-        *(f"{_SOURCES.get(source, (source,))[0]} ({types[source]})" for source in sources),
-        "u",
-        "k",
-        "U",
-    )
+    names = (f"{_SOURCES.get(source, (source,))[0]} ({types[source]})" for source in sources)
+    header = ("sensor", "channel", *names, "u", "k", "U")
     rows = []
     for budget in budgets:
-        by_source: dict[str, Component] = {each.source: each for each in budget.components}
-        rows.append(
-            (
-                budget.sensor,
-                budget.channel,
-                *(
-                    share(by_source[source].relative) if source in by_source else ""
-                    for source in sources
-                ),
-                share(budget.combined),
-                f"{budget.k:.2f}",
-                share(budget.k * budget.combined),
-            )
-        )
+        shares = {each.source: share(each.relative) for each in budget.components}
+        totals = share(budget.combined), f"{budget.k:.2f}", share(budget.k * budget.combined)
+        parts = (shares.get(source, "") for source in sources)
+        rows.append((budget.sensor, budget.channel, *parts, *totals))
     return _table(header, rows)
 
 
@@ -224,15 +198,10 @@ def noise_table(found: Calibration, unit: str) -> Table:
     rows = []
     for each in found.whole_band("noise"):
         low, high = each.interval
-        down = f"−{decibels(each.value) - decibels(low):.2f}" if low > 0 else "−∞"
-        rows.append(
-            (
-                each.sensor,
-                each.channel,
-                f"{signed(decibels(each.value), '.2f')}",
-                f"+{decibels(high) - decibels(each.value):.2f} {down}",
-            )
-        )
+        level = decibels(each.value)
+        down = f"−{level - decibels(low):.2f}" if low > 0 else "−∞"
+        interval = f"+{decibels(high) - level:.2f} {down}"
+        rows.append((each.sensor, each.channel, signed(level, ".2f"), interval))
     header = ("sensor", "channel", f"noise (dB re 1 ({unit})²/Hz)", "expanded (dB)")
     return _table(header, rows)
 

@@ -138,18 +138,15 @@ def lines(rows: Iterable[CheckRow], *, failures_only: bool = False) -> list[Text
 
 def document(rows: Iterable[CheckRow]) -> list[dict[str, Any]]:
     """Return the rows for JSON, each with its sentence."""
-    found = []
-    for row in rows:
-        text = PASSED[row.check] if row.finding is None else sentence(row.finding)
-        found.append(
-            {
-                "check": row.check,
-                "outcome": row.outcome,
-                "text": text,
-                "finding": row.finding,
-            }
-        )
-    return found
+    return [
+        {
+            "check": row.check,
+            "outcome": row.outcome,
+            "text": PASSED[row.check] if row.finding is None else sentence(row.finding),
+            "finding": row.finding,
+        }
+        for row in rows
+    ]
 
 
 def _size(n_bytes: float) -> str:

@@ -19,7 +19,7 @@ def safe_cell(text: str) -> str:
     return f"'{text}" if text.startswith(_FORMULA) else text
 
 
-def csv_text(header: Sequence[str] | None, rows: Iterable[Sequence[object]]) -> str:
+def csv_text(header: Iterable[str] | None, rows: Iterable[Sequence[object]]) -> str:
     """Return a table as CSV, or rows of it without a header.
 
     Texts are made safe, None is empty.

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from daq.estimation.snapshot import Snapshot
-    from daq.estimation.snapshot_diagnostics import (
-        Diagnosis,
-    )
+    from daq.estimation.snapshot_diagnostics import Diagnosis
     from daq.results.facts.fact import Fact
     from estimator.checks.advice import Names
     from estimator.checks.stability import Stability

@@ -149,12 +149,17 @@ class SettingsDocument(TypedDict):
     target_cov: Annotated[float | None, "Wanted coefficient of variation."]
 
 
-class ChannelDocument(TypedDict):
-    """Spectra of one channel, a value for each frequency."""
+class LabelDocument(TypedDict):
+    """`daq.estimation.snapshot.ChannelLabel`."""
 
     sensor: Annotated[str, "Name of the sensor."]
     channel: Annotated[str, "Name of the channel."]
     unit: Annotated[str, "Unit of the motion. PSDs are in its square per Hz."]
+
+
+class ChannelDocument(LabelDocument):
+    """Spectra of one channel, a value for each frequency."""
+
     data_psd: Annotated[Row, "PSD of what the channel recorded, one-sided, in unit²/Hz."]
     noise_psd: Annotated[
         Row,
@@ -358,12 +363,9 @@ class ContributionDocument(TypedDict):
     above: Annotated[float, "How far the upper end is raised, in unit²/Hz; null: without limit."]
 
 
-class BandMeanDocument(TypedDict):
+class BandMeanDocument(LabelDocument):
     """Mean of one channel in the band of interest."""
 
-    sensor: Annotated[str, "Name of the sensor."]
-    channel: Annotated[str, "Name of the channel."]
-    unit: Annotated[str, "Unit of the motion."]
     method: Annotated[str, "Method."]
     low_hz: Annotated[Finite, "Lower end of the band."]
     high_hz: Annotated[Finite, "Upper end of the band."]
@@ -390,12 +392,9 @@ class TermDocument(TypedDict):
     error: Annotated[float, "Its standard error."]
 
 
-class ChannelNoiseDocument(TypedDict):
+class ChannelNoiseDocument(LabelDocument):
     """Noise terms of one channel, by the first method."""
 
-    sensor: Annotated[str, "Name of the sensor."]
-    channel: Annotated[str, "Name of the channel."]
-    unit: Annotated[str, "Unit of the motion."]
     terms: Annotated[
         Mapping[str, TermDocument] | None,
         "By name: random-walk (f⁻²), flicker (f⁻¹), white, f-squared (f²).",
@@ -569,18 +568,13 @@ class SegmentDocument(TypedDict):
     ]
 
 
+_BELOW = "Level below which {} % of the stretches are: frequencies × channels."
 PercentileDocument = TypedDict(
     "PercentileDocument",
     {
-        "10": Annotated[
-            Table, "Level below which 10 % of the stretches are: frequencies × channels."
-        ],
-        "50": Annotated[
-            Table, "Level below which 50 % of the stretches are: frequencies × channels."
-        ],
-        "90": Annotated[
-            Table, "Level below which 90 % of the stretches are: frequencies × channels."
-        ],
+        "10": Annotated[Table, _BELOW.format(10)],
+        "50": Annotated[Table, _BELOW.format(50)],
+        "90": Annotated[Table, _BELOW.format(90)],
     },
 )
 

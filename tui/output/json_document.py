@@ -22,7 +22,7 @@ from estimator.records import json_keys
 from estimator.self_noise.result import Flag
 from tui import __version__
 from tui.output.calibration import channels_of
-from tui.output.json_values import json_text, plain
+from tui.output.json_values import json_text, label_document, plain
 from tui.output.noise_parameters import noise_parameters_document
 from tui.wording.verdict_text import Decision
 
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daq.estimation.snapshot import Snapshot
-    from daq.estimation.snapshot_diagnostics import (
-        Synchronisation,
-    )
+    from daq.estimation.snapshot_diagnostics import Synchronisation
     from daq.results.calibration import Calibration
     from daq.results.noise_parameters import ChannelParameters
     from daq.results.result import Result
@@ -65,9 +63,7 @@ def result_document(snapshot: Snapshot, method: str) -> EstimateDocument:
         "frequency_hz": snapshot.frequency,
         "channels": [
             {
-                "sensor": label.sensor,
-                "channel": label.channel,
-                "unit": label.unit,
+                **label_document(label),
                 "data_psd": data[:, column],
                 "noise_psd": noise.noise_psd[:, column],
                 "noise_psd_low": noise.low[:, column],
@@ -226,9 +222,7 @@ def _band_means(result: Result) -> list[BandMeanDocument]:
             mean, total = means[column], level_budget(found, column, label, band)
             documents.append(
                 {
-                    "sensor": label.sensor,
-                    "channel": label.channel,
-                    "unit": label.unit,
+                    **label_document(label),
                     "method": method,
                     "low_hz": band[0],
                     "high_hz": band[1],

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import orjson
 
 from estimator.records import json_keys
+
+if TYPE_CHECKING:
+    from daq.estimation.snapshot import ChannelLabel
+    from tui.output.documents import LabelDocument
 
 
 def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any:  # noqa: ANN401
@@ -33,6 +37,11 @@ def plain(value: Any, *, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any
     if isinstance(value, list | tuple):
         return [plain(entry, array=array) for entry in value]
     return value
+
+
+def label_document(label: ChannelLabel) -> LabelDocument:
+    """Return what a channel is called, and the unit of its motion."""
+    return {"sensor": label.sensor, "channel": label.channel, "unit": label.unit}
 
 
 def json_text(document: Any) -> str:  # noqa: ANN401 - any result

@@ -16,6 +16,7 @@ from daq.results.noise_parameters import (
 )
 from estimator.noise_parameters.fit import Term
 from estimator.wording import percent, span
+from tui.output.json_values import label_document
 from tui.page.table import Table
 from tui.wording.formatting import level, scientific
 
@@ -173,9 +174,7 @@ def noise_parameters_document(
     """Return the noise parameters of every channel as JSON values."""
     return [
         {
-            "sensor": each.label.sensor,
-            "channel": each.label.channel,
-            "unit": each.label.unit,
+            **label_document(each.label),
             "terms": None
             if each.parameters is None
             else {

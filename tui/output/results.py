@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from daq.results.band_summary import data_interval
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.self_noise.result import Flag
 from estimator.wording import clock_time, several
+from tui.output.csv_text import csv_text, safe_cell
 from tui.output.curves import CURVES
 from tui.page.table import Cell, Table
 from tui.wording.formatting import level, level_with_error, utc
@@ -69,15 +70,8 @@ def averages_line(snapshot: Snapshot) -> str:
     return snapshot.caveats.nouns(text)
 
 
-def _not_a_formula(text: str) -> str:
-    """Return a cell that a spreadsheet does not calculate, whatever a sensor is called."""
-    return f"'{text}" if text[:1] in set("=+-@\t\r") else text
-
-
 def curves_csv(snapshot: Snapshot) -> str:
     """Return all curves as CSV: a row per frequency, a group of columns per channel and method."""
-    import csv  # noqa: PLC0415 - most results are shown, or written as JSON
-
     header = ["frequency (Hz)"]
     columns = [snapshot.frequency]
     for number, label in enumerate(snapshot.channels):
@@ -88,9 +82,6 @@ def curves_csv(snapshot: Snapshot) -> str:
             for each in CURVES:
                 header.append(f"{name} {method} {each.word}{f' {unit}' * each.is_density}")
                 columns.append(getattr(noise, each.field)[:, number])
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(map(_not_a_formula, header))
-    for row in np.stack(columns, axis=1):
-        writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
-    return text.getvalue()
+    table = np.stack(columns, axis=1).tolist()
+    rows = ([None if math.isnan(value) else value for value in row] for row in table)
+    return csv_text(map(safe_cell, header), rows)

@@ -32,28 +32,6 @@ HEADROOM = 30.0
 DIRECTIONS = ("X", "Y", "Z")
 
 
-def simulate(scenario: Scenario, duration: float) -> dict[str, FloatArray]:
-    """Simulate the samples of every sensor.
-
-    Parameters
-    ----------
-    scenario
-        Motion and sensors.
-    duration
-        In seconds.
-
-    Returns
-    -------
-    dict of float64 arrays, shape (n_samples, n_channels)
-        In m/s², by sensor.
-    """
-    world = World(scenario)
-    return {
-        name: world.samples(name, 0, round(duration * model.sampling_rate))
-        for name, model in scenario.sensors.items()
-    }
-
-
 def simulate_recording(
     scenario: str, *, out: Path, duration: float | None, json: str | None
 ) -> None:

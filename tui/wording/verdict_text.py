@@ -24,11 +24,7 @@ if TYPE_CHECKING:
     from daq.results.facts.fact import Fact
     from daq.results.result import Result
 
-WORDS: Mapping[Verdict, str] = {
-    Verdict.PASS: "PASS",
-    Verdict.FAIL: "FAIL",
-    Verdict.NOT_DECIDED: "NOT DECIDED",
-}
+WORDS: Mapping[Verdict, str] = {each: each.upper().replace("-", " ") for each in Verdict}
 STYLES: Mapping[Verdict, str] = {
     Verdict.PASS: "bold green",
     Verdict.FAIL: "bold red",

@@ -14,7 +14,7 @@ from rich.console import Console, RenderableType
 from scipy.linalg import block_diag
 
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import Octave
+from daq.estimation.snapshot import Octave, Snapshot
 from daq.results.result import Result
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, rotation, said
@@ -25,9 +25,7 @@ from tui.page.terminal import terminal_table
 
 def test_angles_have_the_minus_of_typography() -> None:
     other_way = block_diag(*(rotation(-2 * angle) for angle in (0.0, 5.0, 9.0)))
-    assert "−5.000°" in shown(
-        details(diagnosed(other_way), Result(diagnosed(other_way), Settings()).facts)
-    )
+    assert "−5.000°" in in_full(diagnosed(other_way))
 
 
 @pytest.mark.parametrize(
@@ -48,7 +46,7 @@ def test_names_with_punctuation_are_kept_whole(sensors: tuple[str, ...]) -> None
     for one, two in ((f"{c}.X", f"{a}.Y"), (f"{c}.Y", f"{b}.X")):
         assert re.search(rf"{re.escape(one)} \w+( as)? {re.escape(two)}", line)
     for snapshot in (reversed_, exchanged):
-        printed = " ".join(shown(details(snapshot, Result(snapshot, Settings()).facts)).split())
+        printed = " ".join(in_full(snapshot).split())
         assert all(f"{one} → {two}" in printed for one, two in combinations(sensors, 2))
         assert f"{c}.Z has" in printed or f"{c}.X" in printed
 
@@ -60,8 +58,13 @@ def shown(parts: Sequence[RenderableType]) -> str:
     return console.export_text()
 
 
+def in_full(snapshot: Snapshot) -> str:
+    """Return the whole diagnosis of a snapshot as it is printed."""
+    return shown(details(snapshot, Result(snapshot, Settings()).facts))
+
+
 def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> None:
-    text = shown(details(diagnosed(), Result(diagnosed(), Settings()).facts))
+    text = in_full(diagnosed())
     legend = "Model test: its statistic over its expectation, 1 if one common motion"
     assert legend in " ".join(text.split())
     assert "A → B 5.000 ±0.000 5.000 ±0.000 1.0000 ±0.0000 0.0 ±0.0 0.00 ±0.00" in " ".join(
@@ -70,7 +73,7 @@ def test_the_long_form_explains_its_columns_and_leaves_out_empty_tables() -> Non
     assert "e+0" not in text
     dead = np.eye(9)
     dead[4, 4] = 0
-    without = shown(details(diagnosed(dead), Result(diagnosed(dead), Settings()).facts))
+    without = in_full(diagnosed(dead))
     assert "Orientation, gain and delay" not in without
     assert "invalidates the result: B.Y has no signal" in without
 
@@ -81,7 +84,7 @@ def test_octaves_say_what_each_has_left_out() -> None:
         Octave(20.1, 100.0, 10.0, 100, 94.0, {Reason.GAP: 2, Reason.TRANSIENT: 3}),
     )
     snapshot = replace(diagnosed(), octaves=octaves)
-    text = " ".join(shown(details(snapshot, Result(snapshot, Settings()).facts)).split())
+    text = " ".join(in_full(snapshot).split())
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
 
 

@@ -22,7 +22,7 @@ from tests.tui.service.bench_files import HOURLY, Place
 from tests.waiting import limit
 from tui import __version__
 from tui.commands.serve import is_alive, signs_of_life
-from tui.output.logs.lines import JournalHandler, fields_of
+from tui.output.logs.lines import JournalHandler
 from tui.service.hooks import HookRunner
 from tui.service.metrics import MetricsError, ServiceMetrics
 from tui.service.notify import Notifier, watchdog_interval
@@ -172,7 +172,7 @@ def test_the_journal_gets_typed_fields(tmp_path: Path) -> None:
     address = str(tmp_path / "journal")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
         journal.bind(address)
-        handler = JournalHandler(fields_of, address)
+        handler = JournalHandler(address)
         record = logging.makeLogRecord(
             {"name": "tui", "levelno": logging.ERROR, "msg": "two\nlines", "run": "failed", "n": 3}
         )

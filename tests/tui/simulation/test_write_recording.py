@@ -14,7 +14,7 @@ from sim_devices.errors import ScenarioError
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
-from tui.simulation.write_recording import bench_of, simulate, simulate_recording, write
+from tui.simulation.write_recording import bench_of, simulate_recording, write
 
 BENCH = Path(__file__).parents[3] / "tui" / "resources" / "bench.toml"
 
@@ -24,14 +24,14 @@ def test_a_recording_holds_what_the_sensors_read_to_a_count(tmp_path: Path) -> N
     said = tmp_path / "said.json"
     simulate_recording("fig9", out=out, duration=25.0, json=str(said))
     scenario = paper_scenarios.fig9()
-    read = simulate(scenario, 25.0)
+    world = World(scenario)
     recording = Recording.open(out)
     assert recording.closed
     assert [sensor.name for sensor in recording.sensors] == list(scenario.names)
     for sensor in recording.sensors:
         assert sensor.n_samples == 5000
         sensitivity = [channel.sensitivity for channel in sensor.channels]
-        away = sensor.counts(0, 5000) - read[sensor.name] * sensitivity
+        away = sensor.counts(0, 5000) - world.samples(sensor.name, 0, 5000) * sensitivity
         assert np.max(np.abs(away)) <= 0.5
         assert np.max(np.abs(sensor.counts(0, 5000))) > 1e7  # and counts are fine enough
     assert recording.bench is not None

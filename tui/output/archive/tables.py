@@ -143,14 +143,8 @@ def _segment(segment: Segment) -> str:
 def _interval(found: Interval, *, plus: bool = False) -> str:
     if math.isnan(found.value):
         return "not decided"
-    return _with_interval(found.value, found.high, plus=plus)
-
-
-def _with_interval(value: float, high: float, *, plus: bool = False) -> str:
-    if math.isnan(value):
-        return "?"
-    half = high - value
+    half = found.high - found.value
     digits = max(0, min(_MOST_DIGITS, 1 - math.floor(math.log10(half)))) if half > 0 else 2
     spec = f"{'+' if plus else ''}.{digits}f"
     shown = f"{half:.{digits}f}" if 2 * half >= 10**-digits else f"<{10**-digits:.{digits}f}"
-    return f"{signed(value, spec)} ±{shown}"
+    return f"{signed(found.value, spec)} ±{shown}"

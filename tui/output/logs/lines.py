@@ -32,10 +32,7 @@ SILENCED = ("pymodbus",)
 COMMAND = logging.getLogger("huddle")
 """The logger of the command itself."""
 _RESERVED = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
-_CONTROL = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))} | {
-    ord("\n"): "\\n",
-    ord("\t"): "\\t",
-}
+_CONTROL = SHOWN_CONTROLS | {ord("\n"): "\\n", ord("\t"): "\\t"}
 
 
 class TextFormatter(logging.Formatter):
@@ -114,9 +111,7 @@ def configure(
     if file is not None:
         handler = logging.FileHandler(file, encoding="utf-8")
     elif style is LogFormat.JOURNAL:
-        from tui.output.logs.lines import JournalHandler
-
-        handler = JournalHandler(fields_of)
+        handler = JournalHandler()
     else:
         handler = _ConsoleHandler() if screen else logging.NullHandler()
     handler.setFormatter(JsonFormatter() if style is LogFormat.JSON else TextFormatter())
@@ -232,8 +227,6 @@ class JournalHandler(logging.Handler):
 
     Parameters
     ----------
-    fields_of : callable
-        Returns the typed fields of a record.
     address : str
         Of the socket.
 
@@ -243,11 +236,10 @@ class JournalHandler(logging.Handler):
         If there is no journal.
     """
 
-    def __init__(self, fields_of: Any, address: str = ADDRESS) -> None:  # noqa: ANN401 - a function
+    def __init__(self, address: str = ADDRESS) -> None:
         import socket
 
         super().__init__()
-        self._fields_of = fields_of
         self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             self._channel.connect(address)
@@ -258,7 +250,7 @@ class JournalHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Send a record."""
         try:
-            self._channel.send(entry(record, self._fields_of(record)))
+            self._channel.send(entry(record, fields_of(record)))
         except Exception:  # noqa: BLE001 - a log line that cannot be written ends no command
             self.handleError(record)
 
