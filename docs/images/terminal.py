@@ -46,7 +46,7 @@ async def photograph(recording: Path, *, size: tuple[int, int], keys: tuple[str,
         bench = opened.bench
     app = HuddleApp(RecordingControls(recording, settings, bench), path=recording)
     async with app.run_test(size=size) as pilot:
-        while app.snapshot is None:
+        while app.state.snapshot is None:
             await pilot.pause(0.1)
         await pilot.press(*keys)
         await pilot.pause(0.5)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.bench.model import Bench
+from daq.bench.model import Bench, Limit
 from daq.clocks.clock_model import ClockSource, ClockState
 from daq.devices.bench_file import parse
 from daq.devices.interface import DeviceInformation
@@ -244,9 +244,13 @@ def empty_snapshot() -> Snapshot:
     )
 
 
-def demo_bench() -> Bench:
-    """Return the bench of the demo: three sensors, no limits."""
-    return parse(DEMO)
+LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
+
+
+def demo_bench(*limits: Limit) -> Bench:
+    """Return the bench of the demo: three sensors, without limits of its own."""
+    bench = parse(DEMO)
+    return bench.model_copy(update={"limits": limits}) if limits else bench
 
 
 @contextmanager

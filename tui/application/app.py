@@ -157,9 +157,9 @@ class HuddleApp(FollowingApp):
             state = self.state
             return state.can_start and not state.is_recording and not state.is_starting
         if action in {"stop", "mark"}:
-            return self.recording and self.now is not None
+            return self.state.is_recording and self.state.now is not None
         if action == "save":
-            return self.snapshot is not None and self.path is not None
+            return self.state.snapshot is not None and self.state.path is not None
         if action in {"report", "open_report", "issue"}:
             return self.state.has_result
         return True
@@ -171,7 +171,7 @@ class HuddleApp(FollowingApp):
             if plan is not None:
                 self._begin(plan, checked=True)
 
-        kept = "" if self.path is None else self.path.name
+        kept = "" if self.state.path is None else self.state.path.name
         self.push_screen(StartForm(self._controls.bench, kept), start)
 
     def _note(self, note: str) -> None:
@@ -222,22 +222,22 @@ class HuddleApp(FollowingApp):
 
     def action_stop(self) -> None:
         """Stop the recorder, once that has been confirmed."""
-        if self.path is None or self.now is None:
+        if self.state.path is None or self.state.now is None:
             return
-        path = self.path
+        path = self.state.path
 
         def stop(really: bool | None) -> None:
             if really:
                 self.state = replace(self.state, note="stopping …")
                 self._control(path, "stop")
 
-        self.push_screen(StopScreen(clock_time(self.now.elapsed)), stop)
+        self.push_screen(StopScreen(clock_time(self.state.now.elapsed)), stop)
 
     def action_mark(self) -> None:
         """Ask for a remark and mark the moment."""
-        if self.path is None:
+        if self.state.path is None:
             return
-        path, began = self.path, time.monotonic()
+        path, began = self.state.path, time.monotonic()
 
         def mark(text: str | None) -> None:
             if text is not None:
@@ -267,7 +267,7 @@ class HuddleApp(FollowingApp):
         self._write_report(is_opened=True)
 
     def _write_report(self, *, is_opened: bool) -> None:
-        path, result = self.path, self.state.result
+        path, result = self.state.path, self.state.result
         if path is None or result is None or not result.snapshot.closed:
             return
         self.notify("writing the report …", timeout=3)
@@ -289,7 +289,7 @@ class HuddleApp(FollowingApp):
 
     def action_issue(self) -> None:
         """Ask who authorises a certificate, and issue it; without anybody, make a specimen."""
-        path, result = self.path, self.state.result
+        path, result = self.state.path, self.state.result
         if path is None or result is None or not result.snapshot.closed:
             return
 
@@ -322,7 +322,7 @@ class HuddleApp(FollowingApp):
             return
 
         def make(really: bool | None) -> None:
-            path, result = self.path, self.state.result
+            path, result = self.state.path, self.state.result
             if really and path and result:
                 self._issue(path, result, {**wanted, "by": ""})
 
@@ -332,9 +332,9 @@ class HuddleApp(FollowingApp):
 
     def action_save(self) -> None:
         """Write the estimate as CSV and JSON, and the screen as a picture (SVG)."""
-        if self.path is not None and self.state.result is not None:
-            picture = self.export_screenshot(title=self.path.name)
-            self._save(self.path, picture, self.state.result)
+        if self.state.path is not None and self.state.result is not None:
+            picture = self.export_screenshot(title=self.state.path.name)
+            self._save(self.state.path, picture, self.state.result)
 
     @work(thread=True, group="control", description="the result is saved")
     def _save(self, path: Path, picture: str, result: Result) -> None:

@@ -178,10 +178,13 @@ class FirstBenchScreen(Screen[None]):
     def _is_searching(self) -> bool:
         return any(said == "searching …" for said in self._searched.values())
 
+    @property
+    def _known_ports(self) -> set[str]:
+        return set() if self._bench is None else {each.port for each in self._bench.sensors}
+
     def action_search(self) -> None:
         """Search the serial ports that no sensor is known on."""
-        known = set() if self._bench is None else {each.port for each in self._bench.sensors}
-        used = {port for port, found in self._devices.items() if found} | known
+        used = {port for port, found in self._devices.items() if found} | self._known_ports
         self._begin([port for port in self._controls.ports if port not in used])
 
     def action_network(self) -> None:
@@ -246,7 +249,7 @@ class FirstBenchScreen(Screen[None]):
             self._draw()
             return
         text = self._text  # all at once: names follow the ports, whichever answers first
-        known = set() if self._bench is None else {each.port for each in self._bench.sensors}
+        known = self._known_ports
         for one in self._searched:
             for device in self._devices.get(one, ()):
                 before, text = text, (text if one in known else with_device(text, device))

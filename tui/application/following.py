@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
-    from daq.recording.monitor import RecordingStatus
     from tui.application.controls import Controls
 
 Outcome = TypeVar("Outcome")
@@ -185,7 +183,7 @@ class FollowingApp(ThemedApp[None]):
 
     @on(messages.SensorsNoted)
     def _on_noted(self, message: messages.SensorsNoted) -> None:
-        if message.path == self.path:
+        if message.path == self.state.path:
             self.state = replace(self.state, sensors_since=message.lines)
 
     @on(messages.StatusUpdated)
@@ -198,11 +196,11 @@ class FollowingApp(ThemedApp[None]):
 
     @on(messages.Progress)
     def _on_progress(self, message: messages.Progress) -> None:
-        self.state = replace(self.state, note=note(self.now, message.done, message.total))
+        self.state = replace(self.state, note=note(self.state.now, message.done, message.total))
 
     @on(messages.SnapshotReady)
     async def _on_fresh(self, message: messages.SnapshotReady) -> None:
-        result, before = message.result, self.snapshot
+        result, before = message.result, self.state.snapshot
         snapshot = result.snapshot
         moved = () if snapshot.closed else self._recent.strangers(snapshot)
         if moved and not self._is_moved:
@@ -219,7 +217,7 @@ class FollowingApp(ThemedApp[None]):
     def announce(self, event: str, text: str) -> None:
         """Ring the bell, and start the command for events."""
         self.call_from_thread(self.bell)
-        self._try(partial(self._controls.announce, event, text, self.path))
+        self._try(partial(self._controls.announce, event, text, self.state.path))
 
     async def _show_result(self) -> None:
         """Show the result of a test that has just ended, unless somebody is at something else."""
@@ -295,8 +293,8 @@ class FollowingApp(ThemedApp[None]):
 
     @on(messages.DeletionRequested)
     def _on_deletion(self, message: messages.DeletionRequested) -> None:
-        if message.path == self.path:
-            if self.recording:
+        if message.path == self.state.path:
+            if self.state.is_recording:
                 self.notify("It is being recorded: stop it first.", severity="warning")
                 return
             self._ended.set()
@@ -312,26 +310,6 @@ class FollowingApp(ThemedApp[None]):
     def _read_again(self) -> None:
         if isinstance(view := self.screen_stack[0], RecordingsView):
             view.action_read()
-
-    @property
-    def path(self) -> Path | None:
-        """The recording that is, or was, followed."""
-        return self.state.path
-
-    @property
-    def now(self) -> RecordingStatus | None:
-        """How the recording is doing."""
-        return self.state.now
-
-    @property
-    def snapshot(self) -> Snapshot | None:
-        """The latest estimate."""
-        return self.state.snapshot
-
-    @property
-    def recording(self) -> bool:
-        """Whether a recording is running that is followed here."""
-        return self.state.is_recording
 
     def _try(self, act: Callable[[], Outcome]) -> Outcome | None:
         try:

@@ -93,14 +93,10 @@ class View(Screen[None]):
 
     def __init__(self, state: State) -> None:
         super().__init__()
-        self._state = state
+        self.state = state
+        """What is shown."""
         self._offered: tuple[object, ...] | None = None
         self._is_ready = False
-
-    @property
-    def state(self) -> State:
-        """What is shown."""
-        return self._state
 
     def compose(self) -> ComposeResult:
         """Lay out the frame around the parts of a view."""
@@ -118,7 +114,7 @@ class View(Screen[None]):
 
     def show(self, state: State) -> None:
         """Show this state."""
-        self._state = state
+        self.state = state
         if not self._is_ready:
             return
         self._write_status()
@@ -130,7 +126,7 @@ class View(Screen[None]):
     def on_mount(self) -> None:
         """Draw for the first time."""
         self._is_ready = True
-        self.show(self._state)
+        self.show(self.state)
 
     def on_resize(self, event: Resize) -> None:
         """Fit the terminal's size."""
@@ -145,7 +141,7 @@ class View(Screen[None]):
     def _write_status(self) -> None:
         if self._is_ready:
             self.query_one("#status", Static).update(
-                status_line(self._state, self.VIEW, width=self.app.size.width), layout=False
+                status_line(self.state, self.VIEW, width=self.app.size.width), layout=False
             )
 
 

@@ -210,15 +210,15 @@ def _run(app: HuddleApp, *, again: Path) -> None:
     app.theme = _theme()
     with screen_taken():
         app.run()
-    if app.path is None:
+    if app.state.path is None:
         return
-    if app.recording:
+    if app.state.is_recording:
         notices().print(
-            f"The recording continues: {app.path}\nTo view or stop it: huddle tui {again}",
+            f"The recording continues: {app.state.path}\nTo view or stop it: huddle tui {again}",
             soft_wrap=True,
         )
     else:
-        notices().print(f"Recording: {app.path}", soft_wrap=True)
+        notices().print(f"Recording: {app.state.path}", soft_wrap=True)
 
 
 def _theme() -> str:

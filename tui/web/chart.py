@@ -15,7 +15,7 @@ import numpy as np
 from daq.bench.masks.mask import NOISE_MODELS
 from daq.bench.units import is_motion
 from tui.application.test_view import plotted
-from tui.application.test_view.curves import Curve, level_limits
+from tui.application.test_view.curves import MODEL_STYLE, Curve, level_limits
 from tui.application.test_view.units import SpectrumUnit, units_of
 from tui.web.html import page
 
@@ -98,7 +98,7 @@ def with_models(state: State) -> State:
 
 def _levels(found: Sequence[Curve]) -> tuple[float, float]:
     """Return limits in dB that hold the curves, and of models what is not too far from them."""
-    low, high = level_limits([each for each in found if each.style != plotted.MODEL_STYLE])
+    low, high = level_limits([each for each in found if each.style != MODEL_STYLE])
     whole = level_limits(found)
     return max(whole[0], low - MODEL_RANGE_DB), min(whole[1], high + MODEL_RANGE_DB)
 

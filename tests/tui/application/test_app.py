@@ -16,6 +16,8 @@ from textual.widgets import Static
 
 from daq.bench.end_condition import EndCondition
 from daq.clocks.clock_model import ClockSource
+from daq.estimation.snapshot import Snapshot
+from daq.recording.monitor import RecordingStatus
 from daq.recording.sensor_state import SensorState
 from daq.results.result import Result
 from estimator.self_noise.result import SelfNoise
@@ -23,7 +25,6 @@ from tests.tui.application.screen_text import assert_looks_as_before, resized, s
 from tests.tui.example_snapshot import (
     SETTINGS,
     ProgressCallback,
-    demo_bench,
     diagnosed,
     empty_snapshot,
     growing,
@@ -32,6 +33,7 @@ from tests.tui.example_snapshot import (
     waiting_now,
 )
 from tui.application.app import HuddleApp
+from tui.application.controls import Controls
 from tui.application.messages import RecordingOpened, SnapshotReady, StatusUpdated
 from tui.application.state import BENCH
 from tui.application.test_view.view import TestView
@@ -64,10 +66,22 @@ async def pressed(pilot: Pilot[None], app: HuddleApp, *keys: str) -> str:
 
 @asynccontextmanager
 async def opened(
-    app: HuddleApp, *, size: tuple[int, int], notifications: bool = False
+    controls: Controls,
+    *messages: Message,
+    size: tuple[int, int] = NARROW,
+    path: Path | None = None,
+    notifications: bool = False,
 ) -> AsyncIterator[tuple[HuddleApp, Pilot[None]]]:
-    """Run an application on a terminal of some size."""
+    """Run an application on a terminal of some size, and show what these messages bring.
+
+    A recording with a path that is not there brings nothing else.
+    """
+    app = HuddleApp(controls, path=path)
     async with app.run_test(size=size, notifications=notifications) as pilot:
+        if path is not None:
+            await app.workers.wait_for_complete()
+        if messages:
+            await shown(pilot, app, *messages)
         yield app, pilot
 
 
@@ -78,24 +92,22 @@ def view(app: App[None]) -> TestView:
     return shown
 
 
-def running(*, n_effective: float = 100.0) -> tuple[Message, Message]:
-    """Return what comes from a recording that grows."""
-    return StatusUpdated(made_now()), SnapshotReady(
-        Result(made_snapshot(n_effective=n_effective), SETTINGS)
-    )
+def running(
+    snapshot: Snapshot | None = None,
+    now: RecordingStatus | None = None,
+    *,
+    n_effective: float = 100.0,
+    closed: bool = False,
+) -> tuple[Message, Message]:
+    """Return what comes from a recording, which grows if nothing else is given."""
+    shown = snapshot or made_snapshot(n_effective=n_effective, closed=closed)
+    return StatusUpdated(now or made_now()), SnapshotReady(Result(shown, SETTINGS))
 
 
 def ended() -> tuple[Message, Message]:
     """Return what comes when it has ended."""
-    result = made_snapshot(n_effective=2000, closed=True)
-    return StatusUpdated(made_now(elapsed=2000.0, closed=True)), SnapshotReady(
-        Result(result, SETTINGS)
-    )
-
-
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5")
+    now = made_now(elapsed=2000.0, closed=True)
+    return running(now=now, n_effective=2000, closed=True)
 
 
 # -------------------------------------------------------------------- messages first
@@ -129,7 +141,7 @@ def unfolded(app: HuddleApp) -> str:
 async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
     told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
+    async with opened(told, notifications=True) as (app, pilot):
         await pilot.press("s", "enter")
         await app.workers.wait_for_complete()
         await pilot.pause()
@@ -142,15 +154,14 @@ async def test_start_follows_the_file_and_says_what_is_wrong_with_it(
 
 async def test_a_running_recording_is_found_again(told: ProgressCallback, tmp_path: Path) -> None:
     told.running = tmp_path / "old.h5"
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.pause()
         assert "old.h5" in unfolded(app)
 
 
 async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         both = ("three-sensor", "three-channel")
         assert view(app).choice.methods == both
         for key, channel in (("right", 1), ("down", 4), ("up", 1), ("up", 7), ("left", 6)):
@@ -164,12 +175,9 @@ async def test_channels_sensors_and_methods_by_keys(told: ProgressCallback) -> N
 
 
 async def test_the_result_comes_by_itself_and_its_report_on_request(
-    told: ProgressCallback, tmp_path: Path
+    told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told, path=tmp_path / "run.h5")  # which is not there: nothing else comes
-    async with app.run_test(size=WIDE) as pilot:
-        await app.workers.wait_for_complete()
-        await shown(pilot, app, *running())
+    async with opened(told, *running(), path=told.path, size=WIDE) as (app, pilot):
         assert "95 %" not in screen_text(app)
         await shown(pilot, app, *ended())
         assert "noise, 95 %" in screen_text(app)
@@ -179,8 +187,7 @@ async def test_the_result_comes_by_itself_and_its_report_on_request(
 
 
 async def test_quitting_tells_the_recorder_nothing(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         await pilot.press("q")
     assert told.told == []
     assert app.return_code == 0
@@ -189,7 +196,6 @@ async def test_quitting_tells_the_recorder_nothing(told: ProgressCallback) -> No
 async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Path) -> None:
     """In the table, the titles, the clocks, the details and the result; none is markup."""
     sensors = ("[red]rack:1", "[/]", "a.b :x:")
-    app = HuddleApp(told, path=tmp_path / "[b]run.h5")
     snapshot = diagnosed(sensors=sensors)
     clocks = tuple(
         replace(c, source=ClockSource.SHARED_CLOCK, shared_clock=sensors[0])
@@ -205,10 +211,8 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
         now.events[1], sensor=sensors[1], text=f"\x1b]0;{sensors[2]} [/drop\x9bped]\x07"
     )
     now = replace(now, sensors=status, events=(now.events[0], event))
-    async with app.run_test(size=(200, 60)) as pilot:
-        await app.workers.wait_for_complete()
-        messages = (StatusUpdated(now), SnapshotReady(Result(snapshot, SETTINGS)))
-        await shown(pilot, app, *messages)
+    path = tmp_path / "[b]run.h5"
+    async with opened(told, *running(snapshot, now), path=path, size=(200, 60)) as (app, pilot):
         board = screen_text(app)
         assert all(name in board for name in sensors)
         assert f"{sensors[0]} X " in board
@@ -229,17 +233,11 @@ async def test_names_are_shown_as_they_are(told: ProgressCallback, tmp_path: Pat
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    told.bench = demo_bench()
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    async with opened(told, size=size) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.pause()
         await assert_looks_as_before(pilot, f"{name}-idle")
-        await shown(
-            pilot,
-            app,
-            StatusUpdated(waiting_now()),
-            SnapshotReady(Result(empty_snapshot(), SETTINGS)),
-        )
+        await shown(pilot, app, *running(empty_snapshot(), waiting_now()))
         await assert_looks_as_before(pilot, f"{name}-waiting")
         await shown(pilot, app, *running())
         await pilot.press("down")
@@ -268,10 +266,7 @@ async def test_negative_estimates_are_marked_not_hidden(told: ProgressCallback) 
     cumulants[0, 20:60, 0] = 1e-24
     changed = SelfNoise.of(noise.method, psd, cumulants, noise.flags)
     snapshot = replace(snapshot, results={"three-sensor": changed})
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        await shown(
-            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
-        )
+    async with opened(told, *running(snapshot), size=WIDE) as (app, _pilot):
         text = screen_text(app)
     assert "40 of 199 values at or below zero" in text
     assert "▾" in text.replace("(▾ marks", "")
@@ -288,10 +283,7 @@ async def test_the_worst_is_told_first_and_how_much_more_there_is(told: Progress
             replace(third, state=SensorState.LIVE, stuck=("Y",)),
         ),
     )
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(
-            pilot, app, StatusUpdated(worse), SnapshotReady(Result(made_snapshot(), SETTINGS))
-        )
+    async with opened(told, *running(now=worse)) as (app, pilot):
         text = screen_text(app)
         assert "▲ B has been disconnected for 1:15: check cable and power" in text
         assert "+2: d" in text
@@ -309,7 +301,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
 ) -> None:
     settings = replace(SETTINGS, target_cov=target)
     snapshot = made_snapshot()
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
+    async with opened(told, size=WIDE) as (app, pilot):
         live = tuple(replace(sensor, state=SensorState.LIVE) for sensor in made_now().sensors)
         now = replace(made_now(), sensors=live, until=EndCondition(200.0))
         await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, settings)))
@@ -324,8 +316,7 @@ async def test_how_far_a_test_is_that_ends_by_itself(
 async def test_snapshots_that_come_while_help_is_open_are_drawn_below_it(
     told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         await pilot.press("question_mark")
         await shown(pilot, app, *running(n_effective=500))
         await resized(pilot, (100, 40))

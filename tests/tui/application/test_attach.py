@@ -50,9 +50,11 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
     async with first.run_test(size=(80, 24)) as pilot:
         assert load(bench).recording.duration is not None
         await pilot.press("s", "tab", "tab", *["backspace"] * 9, "enter")  # until x stops it
-        await until(pilot, lambda: first.snapshot is not None and first.snapshot.n_segments > 2)
-        assert first.now is not None
-        assert first.now.until.duration is None
+        await until(
+            pilot, lambda: first.state.snapshot is not None and first.state.snapshot.n_segments > 2
+        )
+        assert first.state.now is not None
+        assert first.state.now.until.duration is None
         assert load(bench).recording.duration is None  # remembered
         await pilot.press("q")
     (recorder,) = controls.started
@@ -61,12 +63,14 @@ async def test_closing_leaves_the_recorder_running_and_it_is_found_again(bench: 
 
     second = HuddleApp(BenchControls(bench, load(bench), settings))
     async with second.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: second.snapshot is not None)
+        await until(pilot, lambda: second.state.snapshot is not None)
         await pilot.press("m", *"here", "enter")
         await until(pilot, lambda: all(w.group != "control" for w in second.workers))
         await pilot.press("x", "x", "enter", "y")
-        await until(pilot, lambda: second.snapshot is not None and second.snapshot.closed)
-        snapshot = second.snapshot
+        await until(
+            pilot, lambda: second.state.snapshot is not None and second.state.snapshot.closed
+        )
+        snapshot = second.state.snapshot
         assert snapshot is not None
         assert {"three-sensor", "three-channel"} <= set(snapshot.results)
         await until(pilot, lambda: "No limits in the bench file" in screen_text(second))

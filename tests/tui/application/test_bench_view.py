@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from textual.pilot import Pilot
 from textual.widgets import Input
 
 from daq.devices.bench_file import load
@@ -72,19 +74,22 @@ def told(tmp_path: Path) -> ProgressCallback:
     return ProgressCallback(tmp_path / "run.h5", bench=demo_bench(), sensors=Reading(SOUND))
 
 
-async def live(told: ProgressCallback, *sensors: SensorPreview) -> Reading:
-    """Prepare what a preview shows."""
+@asynccontextmanager
+async def live(
+    told: ProgressCallback, *sensors: SensorPreview, size: tuple[int, int] = NARROW
+) -> AsyncIterator[tuple[HuddleApp, Pilot[None], Reading]]:
+    """Run an application that reads these sensors, and has shown them."""
     told.sensors = reading = Reading(sensors or SOUND)
-    return reading
+    async with opened(told, size=size) as (app, pilot):
+        await pilot.press("p")
+        reading.begun.wait(limit())
+        await shown(pilot, app)
+        yield app, pilot, reading
 
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    reading = await live(told)
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
-        await shown(pilot, app)
+    async with live(told, size=size) as (app, pilot, reading):
         await assert_looks_as_before(pilot, f"{name}-bench")
         await pilot.press("p")
         reading.is_over.wait(limit())
@@ -97,7 +102,7 @@ async def test_limits_are_changed_in_a_form_also_those_of_a_file(tmp_path: Path)
     path.write_text(f"# mine\n{demo_bench().text}", encoding="utf-8")
     (tmp_path / "sheet.csv").write_text("frequency (Hz), noise (µg/√Hz)\n1, 3\n30, 2\n")
     bench = load(path)
-    async with opened(HuddleApp(BenchControls(path, bench, SETTINGS)), size=NARROW) as (app, pilot):
+    async with opened(BenchControls(path, bench, SETTINGS)) as (app, pilot):
         await pressed(pilot, app, "l", "tab", "tab", *"sheet.csv")
         assert "decided, " in screen_text(app)
         await pilot.press("enter")
@@ -132,11 +137,8 @@ async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(
     dead = a.samples.copy()
     dead[:, 1] = 1.0
     gone = replace(c, samples=c.samples[:0], trouble="sensor 'C' on /dev/ttyUSB2: no answer")
-    reading = await live(told, replace(a, samples=dead), replace(b, is_clipping=True), gone)
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
-        await shown(pilot, app)
+    faulty = replace(a, samples=dead), replace(b, is_clipping=True), gone
+    async with live(told, *faulty) as (app, _, _):
         text = screen_text(app)
     for said in (
         "A.Y does not change: nothing is connected, or it is dead",
@@ -152,25 +154,18 @@ async def test_faults_are_named_with_what_to_do_and_keep_it_from_ready(
 async def test_the_ports_are_released_before_a_test_and_with_the_view(
     told: ProgressCallback, key: str
 ) -> None:
-    reading = await live(told)
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
-        await shown(pilot, app)
+    async with live(told) as (app, pilot, reading):
         await pressed(pilot, app, key, *(["enter"] if key == "s" else []))
         assert reading.is_over.wait(limit())
 
 
 async def test_reading_goes_on_under_help_and_after_a_dialog(told: ProgressCallback) -> None:
-    reading = await live(told)
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
+    async with live(told) as (app, pilot, reading):
         for opens in ("question_mark", "ctrl+p"):
             await pressed(pilot, app, opens)
             assert not reading.is_over.is_set()
             await pilot.press("escape")
-        again = await live(told)
+        told.sensors = again = Reading(SOUND)
         await pressed(pilot, app, "s")
         assert reading.is_over.wait(limit())
         assert "● live" not in screen_text(app)
@@ -189,19 +184,14 @@ def test_a_silent_or_frozen_sensor_is_not_called_live() -> None:
 
 
 async def test_frozen_traces_stay(told: ProgressCallback) -> None:
-    reading = await live(told)
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
-        await shown(pilot, app)
-        await pressed(pilot, app, "f")
-        assert "frozen: f goes on" in screen_text(app)
+    async with live(told) as (app, pilot, _):
+        assert "frozen: f goes on" in await pressed(pilot, app, "f")
 
 
 async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
     told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
 
         async def press(*keys: str) -> str:
             await pilot.press(*keys)
@@ -249,7 +239,6 @@ async def test_a_sensor_is_found_named_checked_as_typed_changed_and_removed(
 async def test_what_certificates_say_is_asked_for_checked_and_kept_in_the_bench_file(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told)
     given = {
         "operator": "Ada",
         "laboratory-name": "Pier Metrology",
@@ -263,7 +252,7 @@ async def test_what_certificates_say_is_asked_for_checked_and_kept_in_the_bench_
         "certificate-decision_rule": "simple-acceptance",
         "certificate-guard_band": "0.5",
     }
-    async with app.run_test(size=NARROW) as pilot:
+    async with opened(told) as (app, pilot):
 
         async def typed(**values: str) -> str:
             for name, value in values.items():
@@ -320,11 +309,7 @@ async def test_hum_is_seen_in_spectra_beside_noise_models_before_a_test(
     rate = a.sensor.sampling_rate
     at = np.arange(len(a.samples)) / rate
     hum = 1e-3 * np.sin(2 * np.pi * 50 * at)[:, None]
-    reading = await live(told, a, replace(b, samples=b.samples + hum), c)
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("p")
-        reading.begun.wait(limit())
-        await shown(pilot, app)
+    async with live(told, a, replace(b, samples=b.samples + hum), c) as (app, pilot, reading):
         text = await pressed(pilot, app, "g")
         assert "NHNM" in text
         assert "NLNM" in text

@@ -287,9 +287,9 @@ async def test_from_cables_to_a_specimen_of_the_certificate_in_few_keys(tmp_path
         app = HuddleApp(controls)
         async with app.run_test(size=SIZES["small"]) as opened:
             await press(opened, "s", "enter")
-            await until(opened, lambda: app.now is not None and app.now.elapsed > 0)
-            assert app.now is not None
-            assert app.now.until.decided
+            await until(opened, lambda: app.state.now is not None and app.state.now.elapsed > 0)
+            assert app.state.now is not None
+            assert app.state.now.until.decided
             for size in SIZES.values():
                 await opened.resize_terminal(*size)
                 await until(opened, lambda: "● recording" in screen_text(app))

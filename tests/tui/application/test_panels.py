@@ -60,7 +60,7 @@ def test_counts_are_grouped_alike() -> None:
     now = made_now()
     much = replace(now.sensors[0], n_samples=113481, n_gaps=1, n_missing=13793)
     now = replace(now, sensors=(much, *now.sensors[1:]))
-    table = sensor_table(now, Result(made_snapshot(), SETTINGS), CHOICE, means=(), width=150)
+    table = sensor_table(now, Result(made_snapshot(), SETTINGS), CHOICE, width=150)
     screen = console()
     with screen.capture() as said:
         screen.print(table)
@@ -75,7 +75,7 @@ def test_names_of_channels_are_shown_whole_with_and_without_room_for_errors(
 ) -> None:
     snapshot = diagnosed(channels=("X-1", "Y±2", "Z"))
     means = noise_in_band(Result(snapshot, SETTINGS), CHOICE)
-    table = sensor_table(made_now(), Result(snapshot, SETTINGS), CHOICE, means=means, width=width)
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), CHOICE, width=width)
     screen = console()
     with screen.capture() as said:
         screen.print(table, width=150)

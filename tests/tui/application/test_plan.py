@@ -11,7 +11,6 @@ from textual.events import Key
 
 from daq.bench.editing import with_values
 from daq.bench.end_condition import EndCondition
-from daq.bench.model import Limit
 from daq.caveats import Caveat, Caveats
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, HuddleError
@@ -19,8 +18,9 @@ from daq.recording.sensor_state import SensorState
 from daq.results.result import Result
 from estimator.decision.verdict import Verdict
 from tests.tui.application.screen_text import screen_text
-from tests.tui.application.test_app import NARROW, ended, opened, pressed, running, settled, shown
+from tests.tui.application.test_app import ended, opened, pressed, running, settled, shown
 from tests.tui.example_snapshot import (
+    LIMIT,
     SETTINGS,
     ProgressCallback,
     demo_bench,
@@ -28,15 +28,12 @@ from tests.tui.example_snapshot import (
     made_now,
     made_snapshot,
 )
-from tui.application.app import HuddleApp
 from tui.application.messages import StatusUpdated
 from tui.application.plan import TestPlan
 from tui.application.state import TEST, State
 from tui.application.view import status_line
 from tui.commands.tui_controls import BenchControls, announce
 from tui.wording.verdict_text import WORDS
-
-LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
 
 
 @pytest.mark.parametrize(
@@ -60,7 +57,7 @@ def test_what_is_no_end_is_refused_with_what_was_expected(text: str) -> None:
 
 
 async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
         await pressed(pilot, app, "s")
         for key in (*"ann", "tab", *"hot", "tab"):  # in one burst, as from a serial line
             app.post_message(Key(key, "\t" if key == "tab" else key))
@@ -82,7 +79,7 @@ async def test_the_form_takes_operator_note_and_end(told: ProgressCallback) -> N
 
 
 def test_the_line_at_the_top_of_a_small_terminal_has_the_whole_verdict() -> None:
-    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    bench = demo_bench(LIMIT)
     result = Result(made_snapshot(), SETTINGS, bench)
     verdict = result.verdict
     assert verdict is not None
@@ -98,8 +95,8 @@ def test_the_line_at_the_top_of_a_small_terminal_has_the_whole_verdict() -> None
 async def test_with_limits_a_test_usually_ends_when_they_are_decided(
     told: ProgressCallback,
 ) -> None:
-    told.bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    told.bench = demo_bench(LIMIT)
+    async with opened(told) as (app, pilot):
         await pressed(pilot, app, "s")
         (line,) = [line for line in screen_text(app).splitlines() if " ends " in line]
         assert "decided" in line
@@ -130,7 +127,7 @@ def test_decided_needs_limits_in_the_bench_file_too() -> None:
 
 
 def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -> None:
-    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
+    bench = demo_bench(LIMIT)
     snapshot = made_snapshot(n_effective=2000.0)
     found = Result(snapshot, SETTINGS, bench).verdict
     assert found is not None
@@ -150,8 +147,7 @@ def test_a_test_ends_on_a_verdict_only_if_it_is_surer_than_a_verdict_must_be() -
 
 
 async def test_the_end_and_each_lost_sensor_are_announced_once(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         now = made_now()
         lost = replace(now.sensors[1], state=SensorState.DISCONNECTED, overdue_for=5.0)
         for _ in range(2):

@@ -17,7 +17,6 @@ from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, opened, pressed, running, shown, view
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
-from tui.application.app import HuddleApp
 from tui.application.state import State
 from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.curves import level_limits, noise_curve
@@ -97,8 +96,7 @@ def test_lines_are_dots_in_the_cells_that_they_cross() -> None:
 
 
 async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running(), size=WIDE) as (app, pilot):
         await pressed(pilot, app, "full_stop", "full_stop", "plus", "u", "u", "u")
         title = str(app.screen.query_one("#title", Static).render())
         choice = view(app).choice
@@ -121,8 +119,7 @@ async def test_keys_move_the_cursor_and_change_the_unit(told: ProgressCallback) 
 
 
 async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         await pressed(pilot, app, "f")
         assert "c.o.v. 46 %" in screen_text(app)
         curves = screen_text(app).splitlines()[2:15]
@@ -138,8 +135,7 @@ async def test_frozen_curves_stay_while_the_test_goes_on(told: ProgressCallback)
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running(), size=size) as (app, pilot):
         await pressed(pilot, app, "full_stop", "plus", "u", "t")
         await assert_looks_as_before(pilot, f"{name}-test-cursor")
         await pressed(pilot, app, "escape", "l", "u", "u", "u", "e")
@@ -147,19 +143,12 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
 
 
 def test_limits_and_noise_models_are_curves() -> None:
-    bench = demo_bench().model_copy(
-        update={
-            "limits": (
-                Limit(name="as the site", model="ahnm"),
-                Limit(name="sheet", frequency=(1.0, 30.0), psd=(0.5, 0.5), unit="µg/√Hz"),
-            )
-        }
+    bench = demo_bench(
+        Limit(name="as the site", model="ahnm"),
+        Limit(name="sheet", frequency=(1.0, 30.0), psd=(0.5, 0.5), unit="µg/√Hz"),
     )
-    state = State(
-        "b",
-        result=Result(made_snapshot(), SETTINGS, bench),
-        models=masks_named("nhnm"),
-    )
+    result = Result(made_snapshot(), SETTINGS, bench)
+    state = State("b", result=result, models=masks_named("nhnm"))
     shown = {each.label: each for each in curves(state, Choice(), n_points=60)}
     for label, model in (("as the site", "ahnm"), ("NHNM", "nhnm")):
         curve = shown[label]
@@ -180,8 +169,7 @@ def test_limits_and_noise_models_are_curves() -> None:
 async def test_estimates_are_steps_with_whiskers_and_bins_by_a_key(
     told: ProgressCallback, size: tuple[int, int]
 ) -> None:
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
-        await shown(pilot, app, *running(n_effective=500))
+    async with opened(told, *running(n_effective=500), size=size) as (app, pilot):
         state, choice = app.state, app.screen.choice  # type: ignore[attr-defined]
         for is_fine in (False, True):
             found = curves(state, replace(choice, bins=is_fine), n_points=size[0] - 12)
@@ -208,10 +196,9 @@ async def test_limits_are_drawn_apart_and_named_on_their_lines(told: ProgressCal
         Limit(name=name, frequency=(1.0, 50.0), psd=(psd, psd))
         for name, psd in (("data sheet", 7e-12), ("order 17", 7e-12))
     )
-    told.bench = demo_bench().model_copy(update={"limits": limits})
+    told.bench = demo_bench(*limits)
     for size in (NARROW, (200, 60)):
-        async with opened(HuddleApp(told), size=size) as (app, pilot):
-            await shown(pilot, app, *running())
+        async with opened(told, *running(), size=size) as (app, _pilot):
             found = curves(app.state, Choice(methods=("three-sensor",)), n_points=60)
             drawn = [each for each in found if each.name]
             assert [each.name for each in drawn] == ["data sheet", "order 17"]

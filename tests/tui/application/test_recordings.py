@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import Input
 
 from daq.results.store import store_results
@@ -39,24 +42,39 @@ def entries(folder: Path) -> tuple[Entry, ...]:
     )
 
 
+def closed(path: Path) -> None:
+    """Make a recording that is closed."""
+    with growing(path) as writer:
+        writer.close()
+
+
+@asynccontextmanager
+async def listing(
+    told: ProgressCallback,
+    *listed: Entry,
+    size: tuple[int, int] = NARROW,
+    notifications: bool = False,
+) -> AsyncIterator[tuple[HuddleApp, Pilot[None]]]:
+    """Open the Recordings view, on what there is or on these recordings."""
+    async with opened(told, size=size, notifications=notifications) as (app, pilot):
+        await pilot.press("4")
+        await settled(pilot, app)
+        if listed:
+            app.screen.post_message(CatalogueRead(listed))
+            await shown(pilot, app)
+        yield app, pilot
+
+
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(name: str, size: tuple[int, int], told: ProgressCallback) -> None:
     told.path = told.path.__class__("/bench/run.h5")  # as the pictures show it
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
-        await pilot.press("4")
-        await settled(pilot, app)
-        app.screen.post_message(CatalogueRead(entries(told.folder)))
-        await shown(pilot, app)
+    async with listing(told, *entries(told.folder), size=size) as (app, pilot):
         await pressed(pilot, app, "down")
         await assert_looks_as_before(pilot, f"{name}-recordings")
 
 
 async def test_words_filter_and_escape_shows_all_again(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        await pilot.press("4")
-        await settled(pilot, app)
-        app.screen.post_message(CatalogueRead(entries(told.folder)))
-        await shown(pilot, app)
+    async with listing(told, *entries(told.folder), size=WIDE) as (app, pilot):
         await pilot.press("slash")
         line = app.screen.query_one(Input)
         for words, left in (("LAB pass", "lab-8"), ("ann", "lab-7"), ("2026-11-04", "hall-4")):
@@ -77,28 +95,22 @@ async def test_a_recording_is_opened_and_shows_its_result(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
     path = tmp_path / "old.h5"
-    with growing(path) as writer:
-        writer.close()
+    closed(path)
     store_results(path, made_snapshot(closed=True))
-    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
-        await pilot.press("4")
-        await settled(pilot, app)
+    async with listing(told, notifications=True) as (app, pilot):
         assert "old.h5" in screen_text(app)
         await pilot.press("enter")
         await settled(pilot, app)
         assert told.told == ["about old.h5 {}"]
-        assert app.path == path
+        assert app.state.path == path
         assert app.current_mode == "result"
 
 
 async def test_it_is_estimated_again_with_the_settings_that_were_typed(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
-    with growing(tmp_path / "old.h5") as writer:
-        writer.close()
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("4")
-        await settled(pilot, app)
+    closed(tmp_path / "old.h5")
+    async with listing(told) as (app, pilot):
         await pressed(pilot, app, "e", *"all", "tab", *"abc")
         assert "abc: expected" in screen_text(app)
         await pilot.press("enter")  # not taken
@@ -110,11 +122,8 @@ async def test_it_is_estimated_again_with_the_settings_that_were_typed(
 
 async def test_deleting_is_asked_and_only_y_does_it(told: ProgressCallback, tmp_path: Path) -> None:
     path = tmp_path / "old.h5"
-    with growing(path) as writer:
-        writer.close()
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await pilot.press("4")
-        await settled(pilot, app)
+    closed(path)
+    async with listing(told) as (app, pilot):
         await pilot.press("p")
         await settled(pilot, app)
         assert told.told == ["pin old.h5"]
@@ -131,11 +140,8 @@ async def test_deleting_is_asked_and_only_y_does_it(told: ProgressCallback, tmp_
 async def test_a_recording_that_grows_can_be_opened_but_not_deleted(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
-    app = HuddleApp(told)
     with growing(tmp_path / "new.h5"):
-        async with app.run_test(size=NARROW) as pilot:
-            await pilot.press("4")
-            await settled(pilot, app)
+        async with listing(told) as (app, pilot):
             assert "● recording" in screen_text(app)
             await pressed(pilot, app, "delete", "y", "e")
             assert (tmp_path / "new.h5").exists()

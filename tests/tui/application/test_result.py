@@ -12,7 +12,6 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input
 
-from daq.bench.model import Limit
 from daq.results.result import Result
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import (
@@ -25,7 +24,13 @@ from tests.tui.application.test_app import (
     settled,
     shown,
 )
-from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, made_snapshot
+from tests.tui.example_snapshot import (
+    LIMIT,
+    SETTINGS,
+    ProgressCallback,
+    demo_bench,
+    made_snapshot,
+)
 from tui.application.app import HuddleApp
 from tui.application.forms.estimate import as_changes
 from tui.application.messages import ReferenceReady, SensorsNoted, StatusUpdated
@@ -35,13 +40,10 @@ from tui.commands.tui_controls import save_result
 from tui.output.results import curves_csv
 from tui.simulation.write_recording import simulate_recording
 
-LIMIT = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
-
 
 @pytest.fixture
 def told(tmp_path: Path) -> ProgressCallback:
-    bench = demo_bench().model_copy(update={"limits": (LIMIT,)})
-    return ProgressCallback(tmp_path / "run.h5", bench=bench)
+    return ProgressCallback(tmp_path / "run.h5", bench=demo_bench(LIMIT))
 
 
 def earlier(folder: Path, **changes: object) -> Reference:
@@ -65,7 +67,7 @@ async def at_result(pilot: Pilot[None], app: HuddleApp) -> None:
 
 @pytest.mark.parametrize(("name", "size"), [("narrow", NARROW), ("wide", WIDE)])
 async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]) -> None:
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    async with opened(told, size=size) as (app, pilot):
         await at_result(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-result-limits")
         await shown(pilot, app, ReferenceReady(earlier(told.folder)))
@@ -75,7 +77,7 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
 
 
 async def test_what_cannot_be_compared_says_why_and_c_ends_it(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
+    async with opened(told, size=WIDE) as (app, pilot):
         await at_result(pilot, app)
         await shown(pilot, app, ReferenceReady(earlier(told.folder, unit="m/s")))
         assert "cannot be compared: units differ: m/s² and m/s" in screen_text(app)
@@ -86,9 +88,7 @@ async def test_what_cannot_be_compared_says_why_and_c_ends_it(told: ProgressCall
 
 
 async def test_another_estimate_starts_from_the_settings_shown(told: ProgressCallback) -> None:
-    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
-    async with app.run_test(size=NARROW) as pilot:
-        await app.workers.wait_for_complete()
+    async with opened(told, path=told.path) as (app, pilot):
         await at_result(pilot, app)
         await pressed(pilot, app, "e")
         assert "three-sensor,three-channel" in screen_text(app)
@@ -113,9 +113,7 @@ def test_the_reference_is_estimated_with_the_settings_of_what_is_shown(tmp_path:
 
 
 async def test_the_estimate_and_the_screen_are_saved(told: ProgressCallback) -> None:
-    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
-    async with app.run_test(size=NARROW, notifications=True) as pilot:
-        await app.workers.wait_for_complete()
+    async with opened(told, path=told.path, notifications=True) as (app, pilot):
         await at_result(pilot, app)
         await pilot.press("v")
         await app.workers.wait_for_complete()
@@ -138,8 +136,7 @@ async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
     told: ProgressCallback,
 ) -> None:
     line = "A S4254475: +0.7 ± 0.2 dB since 25 October, 3 tests (1–20 Hz)"
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *ended())
+    async with opened(told, *ended()) as (app, pilot):
         app.state = replace(app.state, path=told.path)
         await shown(pilot, app, SensorsNoted(told.path.with_name("other.h5"), ("of another",)))
         await shown(pilot, app, SensorsNoted(told.path, (line,)))
@@ -152,7 +149,7 @@ async def test_how_sensors_have_changed_stands_with_the_result_by_itself(
 async def test_a_comparison_says_where_a_name_is_another_sensor_now(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
+    async with opened(told, size=WIDE) as (app, pilot):
         status, snapshot = ended()
         assert isinstance(status, StatusUpdated)
         sensors = tuple(replace(s, serial_number=f"S{s.name}") for s in status.now.sensors)
@@ -169,9 +166,7 @@ async def test_a_comparison_says_where_a_name_is_another_sensor_now(
 async def test_i_asks_who_authorises_and_issues_or_makes_a_specimen(
     told: ProgressCallback,
 ) -> None:
-    app = HuddleApp(told, path=told.path)  # which is not there: nothing else comes
-    async with app.run_test(size=NARROW) as pilot:
-        await app.workers.wait_for_complete()
+    async with opened(told, path=told.path) as (app, pilot):
         await at_result(pilot, app)
         assert "i Issue" in screen_text(app)
         await pressed(pilot, app, "i")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from textual.app import App
 from textual.pilot import Pilot
 
 from daq.estimation.snapshot import Snapshot
@@ -37,13 +37,6 @@ START = 1_468_458_000.0
 """UTC of the first sample: 2016-07-14 01:00."""
 
 
-def shown_view(app: App[None]) -> SignalView:
-    """Return the Signal view, which is shown."""
-    found = app.screen_stack[0]
-    assert isinstance(found, SignalView)
-    return found
-
-
 async def reached(pilot: Pilot[None], what: Callable[[], bool]) -> None:
     """Wait until something is the case, which a thread brings about."""
     for _ in range(round(limit(30) / 0.02)):
@@ -53,13 +46,18 @@ async def reached(pilot: Pilot[None], what: Callable[[], bool]) -> None:
     pytest.fail("not reached")
 
 
-async def opened(pilot: Pilot[None], app: HuddleApp, path: Path) -> SignalView:
-    """Open a recording in the Signal view, and wait until it is estimated and drawn."""
-    app.post_message(RecordingOpened(path))
-    await reached(pilot, lambda: app.state.has_result)
-    await pilot.press("5")
-    await reached(pilot, lambda: "A.X" in screen_text(app))
-    return shown_view(app)
+@asynccontextmanager
+async def opened(path: Path, size: str) -> AsyncIterator[tuple[HuddleApp, Pilot[None], SignalView]]:
+    """Open a recording in the Signal view; it is estimated and drawn."""
+    app = HuddleApp(ProgressCallback(path))
+    async with app.run_test(size=SIZES[size]) as pilot:
+        app.post_message(RecordingOpened(path))
+        await reached(pilot, lambda: app.state.has_result)
+        await pilot.press("5")
+        await reached(pilot, lambda: "A.X" in screen_text(app))
+        view = app.screen_stack[0]
+        assert isinstance(view, SignalView)
+        yield app, pilot, view
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +68,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", SIZES)
 async def test_pictures(path: Path, name: str) -> None:
     """The whole recording; then a gap, closer up."""
-    app = HuddleApp(ProgressCallback(path))
-    async with app.run_test(size=SIZES[name]) as pilot:
-        view = await opened(pilot, app, path)
+    async with opened(path, name) as (app, pilot, view):
         await assert_looks_as_before(pilot, f"{name}-signal")
         if name == "narrow":
             await pilot.press(*("t", *"01:00:10", "enter", "+", "+", "+", "+", "g"))
@@ -86,9 +82,7 @@ async def test_pictures(path: Path, name: str) -> None:
 async def test_keys_look_closer_and_go_along(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A zoom is about the cursor; escape shows all; no key prints arrays to describe a worker."""
     monkeypatch.setattr(Snapshot, "__repr__", printed := Mock(return_value=""))
-    app = HuddleApp(ProgressCallback(path))
-    async with app.run_test(size=SIZES["narrow"]) as pilot:
-        view = await opened(pilot, app, path)
+    async with opened(path, "narrow") as (_app, pilot, view):
         await pilot.press("t", *"01:00:30", "enter")
         assert view.look.cursor == START + 30
         await pilot.press("+", "+")
@@ -106,9 +100,7 @@ async def test_keys_look_closer_and_go_along(path: Path, monkeypatch: pytest.Mon
 
 async def test_the_next_mark_is_read_off(path: Path) -> None:
     """At the cursor: when, what, which sensor."""
-    app = HuddleApp(ProgressCallback(path))
-    async with app.run_test(size=SIZES["middle"]) as pilot:
-        view = await opened(pilot, app, path)
+    async with opened(path, "middle") as (app, pilot, view):
         await pilot.press("+", "t", *"01:00:09.5", "enter", "n")
         await reached(pilot, lambda: "B gap: cable" in screen_text(app))
         assert view.look.cursor == pytest.approx(START + 10, abs=0.1)
@@ -118,9 +110,7 @@ async def test_the_next_mark_is_read_off(path: Path) -> None:
 
 async def test_the_mouse_zooms_drags_and_places_the_cursor(path: Path) -> None:
     """About the pointer, as far as it is moved, where it clicks."""
-    app = HuddleApp(ProgressCallback(path))
-    async with app.run_test(size=SIZES["narrow"]) as pilot:
-        view = await opened(pilot, app, path)
+    async with opened(path, "narrow") as (_app, pilot, view):
         await pilot.click("#signal", offset=(17 + 31, 5))
         assert view.look.cursor == pytest.approx(START + 30, abs=1)
         view.action_zoom(0.25, START + 30)
@@ -138,9 +128,7 @@ async def test_the_mouse_zooms_drags_and_places_the_cursor(path: Path) -> None:
 
 async def test_a_stretch_is_excluded_and_taken_back(path: Path) -> None:
     """The estimate follows: without the segments in the stretch, and with them again."""
-    app = HuddleApp(ProgressCallback(path))
-    async with app.run_test(size=SIZES["middle"]) as pilot:
-        view = await opened(pilot, app, path)
+    async with opened(path, "middle") as (app, pilot, view):
         result = app.state.result
         assert result is not None
         whole = result.snapshot.n_segments

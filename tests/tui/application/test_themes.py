@@ -12,9 +12,8 @@ import pytest
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.types import FloatArray
 from tests.tui.application.screen_text import screen_text
-from tests.tui.application.test_app import NARROW, opened, running, shown
+from tests.tui.application.test_app import opened, running, shown
 from tests.tui.example_snapshot import ProgressCallback
-from tui.application.app import HuddleApp
 from tui.application.test_view.plotted import STYLES
 from tui.application.themes import COLOUR_BLIND, NO_COLOUR, SAFE, THEMES
 
@@ -71,7 +70,7 @@ def test_colour_blind_eyes_tell_states_and_curves_apart(eyes: str) -> None:
 
 
 async def test_themes_change_colours_and_nothing_else(tmp_path: Path) -> None:
-    async with opened(HuddleApp(ProgressCallback(tmp_path / "run.h5")), size=NARROW) as (
+    async with opened(ProgressCallback(tmp_path / "run.h5")) as (
         app,
         pilot,
     ):

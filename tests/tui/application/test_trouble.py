@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 
-import pytest
-
-from daq.bench.model import Limit
-from daq.devices.bench_file import parse
 from daq.errors import HuddleError
-from daq.results.result import Result
 from estimator.wording import clock_time
+from tests.daq.results.decision.benches import bench_with
 from tests.tui.application.screen_text import resized, screen_text
 from tests.tui.application.test_app import (
     NARROW,
@@ -26,17 +21,15 @@ from tests.tui.application.test_app import (
     view,
 )
 from tests.tui.example_snapshot import (
-    SETTINGS,
     STRANGER,
     ProgressCallback,
-    demo_bench,
     diagnosed,
     made_now,
     made_snapshot,
     waiting_now,
 )
 from tui.application.app import HuddleApp
-from tui.application.messages import ErrorReported, Progress, SnapshotReady, StatusUpdated
+from tui.application.messages import ErrorReported, Progress, StatusUpdated
 from tui.application.plan import TestPlan
 
 
@@ -52,16 +45,11 @@ class Refusing(ProgressCallback):
         )
 
 
-@pytest.fixture
-def told(tmp_path: Path) -> ProgressCallback:
-    return ProgressCallback(tmp_path / "run.h5")
-
-
 async def test_starting_over_a_result_is_asked_first(
     told: ProgressCallback, tmp_path: Path
 ) -> None:
     path = tmp_path / "old.h5"  # which is not there: nothing else comes
-    async with opened(HuddleApp(told, path=path), size=NARROW) as (app, pilot):
+    async with opened(told, path=path) as (app, pilot):
         await app.workers.wait_for_complete()
         await shown(pilot, app, *running())
         await shown(pilot, app, *ended())
@@ -75,7 +63,7 @@ async def test_starting_over_a_result_is_asked_first(
 
 
 async def test_why_no_recording_started_stays_on_the_screen(tmp_path: Path) -> None:
-    async with opened(HuddleApp(Refusing(tmp_path / "run.h5")), size=NARROW) as (app, pilot):
+    async with opened(Refusing(tmp_path / "run.h5")) as (app, pilot):
         await app.workers.wait_for_complete()
         await pilot.press("s", "enter")
         await settled(pilot, app)
@@ -90,7 +78,7 @@ async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_con
     told: ProgressCallback,
 ) -> None:
     told.wrong = ("B.X reads 0.102 of A and C (g in place of m/s²)", "C.Z is reversed")
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
         for answer in ("escape", "y"):
             await pilot.press("s", "enter")
             await settled(pilot, app)
@@ -106,8 +94,7 @@ async def test_a_red_row_of_the_check_list_keeps_a_test_from_starting_unless_con
 
 
 async def test_a_recorder_that_is_gone_leaves_no_sensor_live(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         assert "● live" in screen_text(app)
         assert "Waits for C." in screen_text(app)
         await shown(pilot, app, ErrorReported("run.h5: the recorder ended", ended=True))
@@ -121,7 +108,7 @@ async def test_states_and_progress_are_there_before_the_first_estimate(
     told: ProgressCallback,
 ) -> None:
     """Of a recording of hours the first estimate takes a while."""
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
         await shown(pilot, app, StatusUpdated(made_now(elapsed=7200.0)), Progress(300, 1000))
         text = screen_text(app)
         assert "● live" in text
@@ -139,10 +126,7 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
     three_channel = snapshot.results["three-channel"]
     sure = replace(three_channel, cov=three_channel.cov * 1e-3)
     snapshot = replace(snapshot, results={**snapshot.results, "three-channel": sure})
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        await shown(
-            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
-        )
+    async with opened(told, *running(snapshot), size=WIDE) as (app, pilot):
         for _ in range(3):
             text = await pressed(pilot, app, "e")
             assert "c.o.v. 46 %" in text
@@ -159,8 +143,7 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
     live = tuple(replace(s, overdue_for=0.0, state=made_now().sensors[0].state)
                  for s in made_now().sensors)  # fmt: skip
     now = replace(made_now(), sensors=live)
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        await shown(pilot, app, StatusUpdated(now), SnapshotReady(Result(snapshot, SETTINGS)))
+    async with opened(told, *running(snapshot, now), size=WIDE) as (app, pilot):
         text = screen_text(app)
         assert "✗ A records none of the motion that B and C share: check its input" in text
         assert text.count("no shared motion") == 3
@@ -172,26 +155,15 @@ async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressC
 async def test_the_verdict_so_far_is_shown_with_how_long_to_record(
     told: ProgressCallback,
 ) -> None:
-    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(8e-12, 8e-12))
-    text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
-    told.bench = parse(text).model_copy(update={"limits": (limit,)})
-    async with opened(HuddleApp(told), size=WIDE) as (app, pilot):
-        snapshot = made_snapshot(n_effective=60.0)
-        await shown(
-            pilot, app, StatusUpdated(made_now()), SnapshotReady(Result(snapshot, SETTINGS))
-        )
+    told.bench = bench_with(8e-12)
+    async with opened(told, *running(n_effective=60.0), size=WIDE) as (app, pilot):
         assert screen_text(app).count("NOT DECIDED") == 2  # beside the time, and with what to do
         await resized(pilot, NARROW)
         await shown(pilot, app)
         assert "recording  1:40  NOT DECIDED" in screen_text(app)
         await resized(pilot, WIDE)
-        snapshot = made_snapshot(n_effective=5000.0, closed=True)
-        await shown(
-            pilot,
-            app,
-            StatusUpdated(made_now(closed=True)),
-            SnapshotReady(Result(snapshot, SETTINGS)),
-        )
+        now = made_now(closed=True)
+        await shown(pilot, app, *running(now=now, n_effective=5000.0, closed=True))
         text = screen_text(app)
     assert "✗ FAIL: 1 of 9 channels above data sheet: C.Z." in text
     assert "C.Z fails 'data sheet'" in text
@@ -214,14 +186,12 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
     csm = (before.n_segments * before.csm + n_new * alone) / n_segments
     now = replace(before, csm=csm, n_segments=n_segments, n_effective=1100.0, elapsed=1100.0)
     same = replace(now, csm=before.csm)
-    limit = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(1e-12, 1e-12))
-    told.bench = demo_bench().model_copy(update={"limits": (limit,)})
+    told.bench = bench_with(1e-12)
     app = HuddleApp(told)
     for second, is_named in ((same, False), (now, True)):
         async with app.run_test(size=WIDE) as pilot:
-            status = StatusUpdated(made_now(elapsed=1100.0))
-            await shown(pilot, app, status, SnapshotReady(Result(before, SETTINGS)))
-            await shown(pilot, app, status, SnapshotReady(Result(second, SETTINGS)))
+            for each in (before, second):
+                await shown(pilot, app, *running(each, made_now(elapsed=1100.0)))
             words = "C records none of the motion that A and B share"
             text = screen_text(app)
             assert (words in text) == is_named

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from daq.bench.model import Limit
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
-from tests.tui.application.test_app import NARROW, ended, opened, pressed, running, settled, shown
+from tests.tui.application.test_app import ended, opened, pressed, running, settled, shown
 from tests.tui.application.test_bench_view import SOUND, Reading
 from tests.tui.application.test_recordings import entries
-from tests.tui.example_snapshot import ProgressCallback, demo_bench
+from tests.tui.example_snapshot import LIMIT, ProgressCallback, demo_bench
 from tests.waiting import limit
-from tui.application.app import HuddleApp
 from tui.application.messages import CatalogueRead
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
 
 
 async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
+    async with opened(told) as (app, pilot):
         footers, helps = set(), set()
         for number, name in enumerate(VIEWS, start=1):
             await pressed(pilot, app, str(number))
@@ -38,8 +36,7 @@ async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: Progre
 async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
     told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=NARROW, notifications=True) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running(), notifications=True) as (app, pilot):
         await pilot.press("question_mark")
         await shown(pilot, app, *ended())
         assert app.current_mode == TEST
@@ -53,8 +50,7 @@ async def test_a_test_that_ends_shows_its_result_but_not_over_a_dialog(
 
 
 async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCallback) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         await pilot.press("3")
         await shown(pilot, app, *running(n_effective=500))
         assert "No result yet" in screen_text(app)
@@ -65,8 +61,7 @@ async def test_what_came_while_a_view_was_hidden_is_shown_in_it(told: ProgressCa
 async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
     told: ProgressCallback,
 ) -> None:
-    async with opened(HuddleApp(told), size=NARROW) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running()) as (app, pilot):
         commands = {each.title: each for each in app.get_system_commands(app.screen)}
         tasks = {"Stop the test", "Show how the clocks drift", "Add a sensor"}
         assert tasks | {"View: Result", "Find a recording by words", "Theme"} <= set(commands)
@@ -84,8 +79,7 @@ async def test_the_palette_lists_the_tasks_of_all_views_and_does_them(
 async def test_the_top_line_keeps_what_matters_when_it_is_narrow(
     told: ProgressCallback, width: int, named: int
 ) -> None:
-    async with opened(HuddleApp(told), size=(width, 24)) as (app, pilot):
-        await shown(pilot, app, *running())
+    async with opened(told, *running(), size=(width, 24)) as (app, _pilot):
         line = screen_text(app).splitlines()[0]
         assert "● recording  1:40" in line
         assert sum(f" {n} {TITLES[name]}" in line for n, name in enumerate(VIEWS, start=1)) == named
@@ -96,9 +90,8 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
     """Verdict, sensors, progress and alert are there at any size."""
     told.path = told.path.__class__("/bench/run.h5")  # as the pictures show it
     told.sensors = reading = Reading(SOUND)
-    mask = Limit(name="data sheet", frequency=(1.0, 30.0), psd=(7e-12, 7e-12))
-    told.bench = demo_bench().model_copy(update={"limits": (mask,)})
-    async with opened(HuddleApp(told), size=size) as (app, pilot):
+    told.bench = demo_bench(LIMIT)
+    async with opened(told, size=size) as (app, pilot):
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-idle")
         await pilot.press("p")

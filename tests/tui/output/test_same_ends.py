@@ -133,7 +133,7 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
             name="mask", frequency=BAND, psd=(1e-11, 1e-11), channels=(label.channel,),
             sensors=(label.sensor,),
         )  # fmt: skip
-        bench = demo_bench().model_copy(update={"limits": (limit,)})
+        bench = demo_bench(limit)
         verdict = Result(snapshot, THIRD, bench).verdict
         assert verdict is not None
         (judged,) = verdict.limits

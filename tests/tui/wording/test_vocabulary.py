@@ -11,7 +11,7 @@ from daq.results.result import Result
 from daq.results.vocabulary import FLAG_WORDS
 from estimator.self_noise.result import Flag
 from tests.tui.example_snapshot import SETTINGS, made_now, made_snapshot, said
-from tui.application.test_view.panels import noise_in_band, sensor_table
+from tui.application.test_view.panels import sensor_table
 from tui.application.test_view.plotted import Choice
 from tui.output.console import console
 
@@ -32,8 +32,7 @@ def test_table_and_remarks_take_their_words_from_one_place(flag: Flag) -> None:
     results = {"three-sensor": replace(noise, flags=flags)}
     snapshot = replace(snapshot, results=results)
     choice = Choice(methods=("three-sensor",))
-    means = noise_in_band(Result(snapshot, SETTINGS), choice)
-    table = sensor_table(made_now(), Result(snapshot, SETTINGS), choice, means=means, width=150)
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), choice, width=150)
     screen = console()
     with screen.capture() as shown:
         screen.print(table, width=150)

@@ -18,8 +18,8 @@ from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.wording import listed
 from tui.application.test_view.braille import DOTS, FIRST
 from tui.application.test_view.clocks import COLOURS
-from tui.application.test_view.curves import Curve, data_curve, mask_curve
-from tui.application.test_view.plotted import MARKERS, MODEL_MARKERS
+from tui.application.test_view.curves import Curve, data_curve, model_curves
+from tui.application.test_view.plotted import MARKERS
 from tui.output.check_list import sentence
 from tui.wording.formatting import readings
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from daq.preflight.preview import SensorPreview
     from tui.application.state import State
 
-MUTED = "#9aa5b8"
 SPECTRUM_SEGMENT, SPECTRUM_POINTS = 2.0, 120
 """Seconds of a segment of the spectra before a test, and points of a curve at most."""
 GAP = 2
@@ -57,9 +56,7 @@ def columns(
     right : collection of str
         Titles of columns that are aligned to the right.
     """
-    widths = [
-        max([cell_len(title), *(row[n].cell_len for row in rows)]) for n, title in enumerate(titles)
-    ]
+    widths = _widths(titles, rows)
     lines = Text(no_wrap=True, end="")
     header = [Text(title, f"bold {MUTED}") for title in titles]
     for number, cells in enumerate([header, *rows]):
@@ -77,10 +74,13 @@ def columns(
 
 def width_of(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> int:
     """Return the columns that these take, with the gap to one more behind them."""
-    return sum(
-        max([cell_len(title), *(row[n].cell_len for row in rows)]) + GAP
-        for n, title in enumerate(titles)
-    )
+    return sum(_widths(titles, rows)) + GAP * len(titles)
+
+
+def _widths(titles: Sequence[str], rows: Sequence[Sequence[Text]]) -> list[int]:
+    return [
+        max([cell_len(title), *(row[n].cell_len for row in rows)]) for n, title in enumerate(titles)
+    ]
 
 
 def trace(values: NDArray[np.float64], *, width: int) -> str:
@@ -268,21 +268,11 @@ def spectra(sensors: Sequence[SensorPreview], models: Sequence[Mask]) -> list[Cu
             marker = "" if of_sensor else MARKERS[number % len(MARKERS)]
             found.append(replace(curve, label=label, band_style="", marker=marker))
             of_sensor += 1
+    if not found:
+        return []
     frequency = np.linspace(0.0, highest, 1 + round(highest * SPECTRUM_SEGMENT))
-    drawn = [
-        mask_curve(
-            frequency,
-            model.at(np.clip(frequency[1:], model.frequency[0], model.frequency[-1]), unit),
-            span=(model.frequency[0], model.frequency[-1]),
-            n_points=SPECTRUM_POINTS,
-            label=model.name,
-            style=MUTED,
-            marker=MODEL_MARKERS[number % len(MODEL_MARKERS)],
-        )
-        for number, model in enumerate(models)
-        if found and _fits(model, unit)
-    ]
-    return [*drawn, *found]
+    fitting = [model for model in models if _fits(model, unit)]
+    return [*model_curves(fitting, frequency, unit, n_points=SPECTRUM_POINTS), *found]
 
 
 def _fits(model: Mask, unit: str) -> bool:

@@ -34,11 +34,6 @@ class IssueForm(Form[Mapping[str, str]]):
         ]
         super().__init__(f"certificate of {name}", fields, does="makes it")
 
-    def problem(self, name: str) -> str:
-        """Return nothing: each text will do."""
-        del name
-        return ""
-
     def submit(self) -> None:
         """Return what was given."""
         self.dismiss({name: self.value(name) for name in HINTS})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 from textual import work
@@ -119,7 +120,6 @@ class SensorForm(Form[str]):
         self._text, self._driver, self._replaces = text, driver, replaces
         self._faults_before = _faults(text)
         self._edited_of = ("", text)
-        self._checked: tuple[object, tuple[FileFault, ...]] = (None, ())
         channels, given = values.get("channels", []), values.get("settings", {})
         self._settings = {
             SETTING + one["name"]: one
@@ -139,10 +139,8 @@ class SensorForm(Form[str]):
                 for name, one in self._settings.items()
             ),
         ]
-        title = (
-            f"sensor {replaces}, driver {driver}" if replaces else f"new sensor, driver {driver}"
-        )
-        super().__init__(title, fields, does="saves")
+        what = f"sensor {replaces}" if replaces else "new sensor"
+        super().__init__(f"{what}, driver {driver}", fields, does="saves")
 
     def hint(self, name: str) -> str:
         """Return what a field means."""
@@ -161,7 +159,7 @@ class SensorForm(Form[str]):
                 return f"{name}: {n_given} for {len(names)} channels; expected 1 or {len(names)}"
         if name == "sensitivity" and not self.value(name):
             return "sensitivity: expected counts per unit, not zero"
-        for fault in self._faults():
+        for fault in _faults(self._edited()):
             if self._field(fault) == name:
                 return str(fault)
         return ""
@@ -172,7 +170,7 @@ class SensorForm(Form[str]):
         known = {fault.key for fault in self._faults_before} & {"sensors"}
         new = [
             fault
-            for fault in self._faults()
+            for fault in _faults(self._edited())
             if fault not in self._faults_before and fault.key not in known
         ]
         if new:
@@ -191,12 +189,6 @@ class SensorForm(Form[str]):
             about = {fault.key.rpartition(".")[2], fault.expected.partition(":")[0]}
             return next((name for name in OF_CHANNELS if name in about), "channels")
         return key if key in KEPT_FIELDS else "name"
-
-    def _faults(self) -> tuple[FileFault, ...]:
-        edited = self._edited()
-        if self._checked[0] != edited:
-            self._checked = edited, _faults(edited)
-        return self._checked[1]
 
     def _edited(self) -> str:
         names = self.value("channels").split()
@@ -231,6 +223,7 @@ def sensor_table(text: str, name: str) -> Mapping[str, Any]:
     return next((one for one in sensors if str(one.get("name")) == name), {})
 
 
+@lru_cache(2)  # every field asks for it when the form is saved
 def _faults(text: str) -> tuple[FileFault, ...]:
     try:
         parse(text)

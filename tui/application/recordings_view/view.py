@@ -16,7 +16,7 @@ from tui.application import messages
 from tui.application.dialogs import QuestionScreen
 from tui.application.forms.estimate import SettingsForm
 from tui.application.state import RECORDINGS, RESULT, TEST, State
-from tui.application.view import MUTED, View
+from tui.application.view import BAD, MUTED, View
 from tui.runs.catalogue import Entry, catalogue
 from tui.wording.verdict_text import STYLES, WORDS
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
 
 
-BAD = "bold #ff6b6b"
 COLUMNS = ("started, UTC", "verdict", "length", "bench", "size", "file")
 """What matters most comes first: a narrow terminal cuts the others."""
 

@@ -53,8 +53,7 @@ AROUND = 300.0
 class SignalDrawn(Message):
     """What a look at a recording shows."""
 
-    path: Path
-    look: Look
+    path: Path | None = None
     drawn: Drawn | None = None
     whole: tuple[float, float] = (0.0, 1.0)
     marks: tuple[float, ...] = ()
@@ -121,11 +120,8 @@ class SignalView(View):
         self._source = source
         self._path: Path | None = None
         self._look = Look()
-        self._drawn: Drawn | None = None
-        self._whole = (0.0, 1.0)
-        self._marks: tuple[float, ...] = ()
+        self._shown = SignalDrawn()
         self._key: object = None
-        self._created: datetime | None = None
         self._settings: Settings | None = None  # of the last result, also while the next is made
         self._note = ""
         self._is_busy = self._is_old = False
@@ -157,7 +153,8 @@ class SignalView(View):
     def draw(self) -> None:
         """Draw the state; what takes time is made in a thread."""
         if self.state.path != self._path:
-            self._path, self._look, self._drawn, self._key = self.state.path, Look(), None, None
+            self._path, self._look, self._key = self.state.path, Look(), None
+            self._shown = SignalDrawn()
             self._note, self._settings = "reading …", None
         self._take_excluded()
         self._write()
@@ -165,11 +162,11 @@ class SignalView(View):
 
     def _take_excluded(self) -> None:
         """Show what the result that is known excludes."""
-        if self.state.result is None or self._created is None:
+        if self.state.result is None or self._shown.created is None:
             return
         if self.state.has_result:
             self._settings = self.state.result.settings
-        found = (stretch(each, self._created) for each in self.state.result.settings.exclude)
+        found = (stretch(each, self._shown.created) for each in self.state.result.settings.exclude)
         excluded = tuple((begin.timestamp(), end.timestamp()) for begin, end in found)
         self._look = replace(self._look, excluded=excluded)
 
@@ -177,8 +174,8 @@ class SignalView(View):
         text = Text(self._note or "No recording is open: 4 lists them.", MUTED)
         if self._path is None:
             text = Text("No recording is open: 4 lists them.", MUTED)
-        elif self._drawn is not None:
-            text = picture(self._drawn, self._look, *self._room)
+        elif self._shown.drawn is not None:
+            text = picture(self._shown.drawn, self._look, *self._room)
         self.query_one("#signal", Static).update(text)
 
     @property
@@ -206,7 +203,7 @@ class SignalView(View):
     # Textual would print all arrays of an argument where a worker has no description.
     @work(thread=True, group="signal", description="the signal is drawn")
     def _make(self, path: Path, look: Look, snapshot: Snapshot | None, *, is_growing: bool) -> None:
-        made = SignalDrawn(path, look)
+        made = SignalDrawn(path)
         try:
             with self._source.lock:
                 signal = self._source.signal(path, is_growing=is_growing, progress=self._progress)
@@ -238,7 +235,7 @@ class SignalView(View):
         self.post_message(made)
 
     def _progress(self, done: int, total: int) -> None:
-        if self._drawn is None:
+        if self._shown.drawn is None:
             self.app.call_from_thread(self._tell, f"reading … {done / max(total, 1):.0%}")
 
     def _tell(self, note: str) -> None:
@@ -251,8 +248,7 @@ class SignalView(View):
         if message.path == self._path:
             self._note = message.note
             if message.drawn is not None:
-                self._drawn, self._whole, self._marks = message.drawn, message.whole, message.marks
-                self._created = message.created
+                self._shown = message
                 self._take_excluded()
             self._write()
             self.refresh_bindings()
@@ -266,32 +262,32 @@ class SignalView(View):
         """Offer only what can be done now."""
         del parameters
         known = self._settings is not None if action == "exclude" else True
-        return action not in ACTIONS or (known and self._drawn is not None)
+        return action not in ACTIONS or (known and self._shown.drawn is not None)
 
     def _change(self, **changes: object) -> None:
         look = replace(self._look, **changes)  # type: ignore[arg-type]  # of several types
-        whole = look.span is not None and look.span == self._whole
+        whole = look.span is not None and look.span == self._shown.whole
         self._look = replace(look, span=None) if whole else look
         self._write()
         self._ask()
 
     @property
     def _span(self) -> tuple[float, float]:
-        return self._look.span or self._whole
+        return self._look.span or self._shown.whole
 
     def action_pan(self, share: float) -> None:
         """Move by a share of what is shown."""
-        self._change(span=panned(self._span, self._whole, share))
+        self._change(span=panned(self._span, self._shown.whole, share))
 
     def action_zoom(self, factor: float, about: float | None = None) -> None:
         """Show this factor of the time, about the cursor."""
         about = self._look.cursor if about is None else about
-        self._change(span=zoomed(self._span, self._whole, factor, about))
+        self._change(span=zoomed(self._span, self._shown.whole, factor, about))
 
     def action_channel(self, step: int) -> None:
         """Choose the next or previous channel."""
-        if self._drawn is not None and self._drawn.waves.traces:
-            n_traces = len(self._drawn.waves.traces)
+        if self._shown.drawn is not None and self._shown.drawn.waves.traces:
+            n_traces = len(self._shown.drawn.waves.traces)
             self._change(channel=(self._look.channel + step) % n_traces)
 
     def action_spectrum(self) -> None:
@@ -336,7 +332,7 @@ class SignalView(View):
 
     def action_mark(self, step: int = 1) -> None:
         """Go to the next or previous mark."""
-        at, marks = self._look.cursor, self._marks
+        at, marks = self._look.cursor, self._shown.marks
         if at is None:
             ahead = marks if step > 0 else marks[::-1]
         else:
@@ -350,7 +346,7 @@ class SignalView(View):
         begin, end = self._span
         if not begin <= time <= end:
             half = (end - begin) / 2
-            begin, end = fitting((time - half, time + half), self._whole)
+            begin, end = fitting((time - half, time + half), self._shown.whole)
         self._change(span=(begin, end), cursor=time)
 
     def action_go(self) -> None:
@@ -359,11 +355,11 @@ class SignalView(View):
         def go(text: str | None) -> None:
             if not text:
                 return
-            time = time_of(text, self._span[0], self._whole)
+            time = time_of(text, self._span[0], self._shown.whole)
             if time is None:
                 self.app.notify(f"{text}: expected a time as 03:12 within the recording")
                 return
-            span = fitting((time - AROUND, time + AROUND), self._whole)
+            span = fitting((time - AROUND, time + AROUND), self._shown.whole)
             self._change(span=span, cursor=time)
 
         self.app.push_screen(GoScreen(), go)
@@ -372,9 +368,9 @@ class SignalView(View):
 
     def _time_at(self, x: int) -> float | None:
         """Return the time of a column of the screen; None beside the picture."""
-        if self._drawn is None:
+        if self._shown.drawn is None:
             return None
-        waves, left = self._drawn.waves, 1 + name_width(self._drawn.waves)
+        waves, left = self._shown.drawn.waves, 1 + name_width(self._shown.drawn.waves)
         columns = self._room[0] + 1 - left
         if not left <= x < left + columns:
             return None
@@ -398,13 +394,13 @@ class SignalView(View):
 
     def on_mouse_move(self, event: MouseMove) -> None:
         """Drag the picture."""
-        if self._dragged is None or self._drawn is None:
+        if self._dragged is None or self._shown.drawn is None:
             return
         begun, (begin, end) = self._dragged
-        columns = self._room[0] - name_width(self._drawn.waves)
+        columns = self._room[0] - name_width(self._shown.drawn.waves)
         self._has_moved |= event.screen_x != begun
         shift = (begun - event.screen_x) * (end - begin) / columns
-        self._change(span=fitting((begin + shift, end + shift), self._whole))
+        self._change(span=fitting((begin + shift, end + shift), self._shown.whole))
 
     def on_mouse_up(self, event: MouseUp) -> None:
         """End dragging; without a movement it was a click, which places the cursor."""

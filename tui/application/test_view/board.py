@@ -15,7 +15,7 @@ from tui.application.test_view import clocks, panels
 from tui.application.test_view.channels import channel_table
 from tui.application.test_view.plot import DriftPlot, PsdPlot
 from tui.application.test_view.plotted import Choice, curves, plot_title, read_out, unit_of
-from tui.application.view import TALL
+from tui.application.view import BAD, MUTED, TALL
 from tui.page.table import Table
 from tui.page.terminal import screen_table, styled
 
@@ -26,12 +26,8 @@ if TYPE_CHECKING:
     from textual.app import ComposeResult
     from textual.events import Resize
 
-    from daq.results.band_summary import BandMeans
     from tui.application.state import State
     from tui.application.test_view.curves import Curve
-
-MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-
 
 SHORT = 14  # rows below which there is no room for curves
 
@@ -98,15 +94,11 @@ class Board(Vertical):
         if choice.clocks:
             table = clocks.clock_table(result, chosen=self._sensor(), width=width - 1)
         elif choice.channels:
-            table = channel_table(shown, choice, means=self._noise(shown), width=width - 1)
+            means = panels.noise_in_band(result, choice)
+            table = channel_table(shown, choice, means=means, width=width - 1)
         else:
             table = panels.sensor_table(
-                now,
-                result,
-                choice,
-                means=self._noise(shown),
-                width=width - 1,
-                is_followed=not shown.trouble,
+                now, result, choice, width=width - 1, is_followed=not shown.trouble
             )
         gap = 2 if choice.channels and not choice.clocks else 1
         self._write("#table", screen_table(table, gap=gap), n_lines=len(table.rows) + 1)
@@ -116,10 +108,6 @@ class Board(Vertical):
         progress = panels.progress_line(now, result, width=width, is_followed=not shown.trouble)
         self._write("#progress", Text(shown.note, MUTED) if shown.note else progress)
         self._write("#advice", styled(panels.advice(result, choice)))
-
-    def _noise(self, shown: State) -> tuple[BandMeans, ...]:
-        """Return the channels' noise."""
-        return () if shown.result is None else panels.noise_in_band(shown.result, self._choice)
 
     def _write_alerts(self, shown: State) -> None:
         alerts = [] if shown.now is None else [*map(styled, panels.alerts(shown.now, shown.result))]

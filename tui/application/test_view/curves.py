@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.bench.masks.mask import Mask
 from daq.bench.units import levels_db
 from daq.results.band_summary import BandMeans
 from estimator.levels.bands import log_edges
 from estimator.types import FloatArray
+
+MODEL_STYLE, MODEL_MARKERS = "#aab4be", "▽△◇○"
+"""Of noise models: colour, and the marker of each in turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +58,14 @@ class Curve:
     def within(self, low: float, high: float) -> Curve:
         """Return the points between two frequencies, as log10 of Hz."""
         inside = (self.log_frequency >= low) & (self.log_frequency <= high)
-        return replace(
-            self,
-            log_frequency=self.log_frequency[inside],
-            level_db=self.level_db[inside],
-            low_db=self.low_db[inside],
-            high_db=self.high_db[inside],
-            negative=self.negative[inside],
-            edges=np.clip(self.edges[inside], low, high) if self.is_stepped else self.edges,
-        )
+        parts: Any = {name: getattr(self, name)[inside] for name in _BY_POINT}
+        if self.is_stepped:
+            parts["edges"] = np.clip(self.edges[inside], low, high)
+        return replace(self, **parts)
+
+
+_BY_POINT = ("log_frequency", "level_db", "low_db", "high_db", "negative")
+"""Attributes with a value for each point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,20 +81,8 @@ class DrawnLine:
 def data_curve(frequency: FloatArray, psd: FloatArray, *, n_points: int, style: str) -> Curve:
     """Return the spectrum of a channel's samples as a curve without an interval."""
     edges = log_edges(frequency, n_points)
-    starts = edges[:-1]
-    mean = np.add.reduceat(psd[: edges[-1]], starts) / np.diff(edges)
-    nothing = np.full(mean.size, np.nan)
-    return Curve(
-        label="data",
-        style=style,
-        band_style=style,
-        marker="",
-        log_frequency=_centres(frequency, edges),
-        level_db=levels_db(mean),
-        low_db=nothing,
-        high_db=nothing,
-        negative=np.zeros(mean.size, dtype=bool),
-    )
+    mean = np.add.reduceat(psd[: edges[-1]], edges[:-1]) / np.diff(edges)
+    return _bare("data", style, "", _centres(frequency, edges), levels_db(mean))
 
 
 def noise_curve(
@@ -121,9 +113,9 @@ def noise_curve(
 
 def mask_curve(
     frequency: FloatArray,
+    mask: Mask,
     psd: FloatArray,
     *,
-    span: tuple[float, float],
     n_points: int,
     label: str,
     style: str,
@@ -133,23 +125,36 @@ def mask_curve(
 
     `psd` is that of ``frequency[1:]``.
     """
-    edges = log_edges(frequency, n_points)
-    centre = _centres(frequency, edges)
+    centre = _centres(frequency, log_edges(frequency, n_points))
     level = np.interp(centre, np.log10(frequency[1:]), levels_db(psd))
-    inside = (centre >= np.log10(span[0]) - 1e-9) & (centre <= np.log10(span[1]) + 1e-9)
-    nothing = np.full(centre.size, np.nan)
-    return Curve(
-        label=label,
-        style=style,
-        band_style=style,
-        marker=marker,
-        log_frequency=centre,
-        level_db=np.where(inside, level, np.nan),
-        low_db=nothing,
-        high_db=nothing,
-        negative=np.zeros(centre.size, dtype=bool),
-        name=label,
-    )
+    low, high = np.log10([mask.frequency[0], mask.frequency[-1]])
+    inside = (centre >= low - 1e-9) & (centre <= high + 1e-9)
+    curve = _bare(label, style, marker, centre, np.where(inside, level, np.nan))
+    return replace(curve, name=label)
+
+
+def model_curves(
+    models: Iterable[Mask], frequency: FloatArray, unit: str, *, n_points: int
+) -> list[Curve]:
+    """Return noise models as curves, those that reach into the spectrum."""
+    found = []
+    for number, model in enumerate(models):
+        low, high = model.frequency[0], model.frequency[-1]
+        if low < frequency[-1] and high > frequency[1]:
+            psd = model.at(np.clip(frequency[1:], low, high), unit)
+            marker = MODEL_MARKERS[number % len(MODEL_MARKERS)]
+            about = {"label": model.name, "style": MODEL_STYLE, "marker": marker}
+            found.append(mask_curve(frequency, model, psd, n_points=n_points, **about))
+    return found
+
+
+def _bare(
+    label: str, style: str, marker: str, log_frequency: FloatArray, level_db: FloatArray
+) -> Curve:
+    """Return a curve without an interval."""
+    nothing = np.full(level_db.size, np.nan)
+    none = np.zeros(level_db.size, dtype=bool)
+    return Curve(label, style, style, marker, log_frequency, level_db, nothing, nothing, none)
 
 
 def _centres(frequency: FloatArray, edges: NDArray[np.int64]) -> FloatArray:

@@ -23,11 +23,11 @@ from tui.wording.formatting import level_with_error
 from tui.wording.verdict_text import headline, how_long, in_tone
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from daq.estimation.snapshot import Snapshot
     from daq.recording.monitor import RecordingStatus, SensorStatus
-    from daq.results.band_summary import BandMeans, Precision, WithoutPartner
+    from daq.results.band_summary import BandMeans, Precision
     from daq.results.facts.fact import Fact
     from daq.results.result import Result
     from tui.application.test_view.plotted import Choice
@@ -48,7 +48,6 @@ def sensor_table(
     result: Result,
     choice: Choice,
     *,
-    means: Sequence[BandMeans],
     width: int,
     is_followed: bool = True,
 ) -> Table:
@@ -56,7 +55,7 @@ def sensor_table(
 
     Without room, rates are omitted first, then numbers of samples, then of gaps.
     """
-    noise = partial(_noise_columns, now, result, choice, means)
+    noise = partial(_noise_columns, now, result, choice)
     columns = {"sensor": [Cell(sensor.name, strong=True) for sensor in now.sensors]}
     columns["state"] = _states(now, is_followed=is_followed)
     columns["Hz"] = [Cell(f"{sensor.sampling_rate:g}") for sensor in now.sensors]
@@ -94,18 +93,13 @@ def _states(now: RecordingStatus, *, is_followed: bool) -> list[Cell]:
 
 
 def _noise_columns(
-    now: RecordingStatus,
-    result: Result,
-    choice: Choice,
-    means: Sequence[BandMeans],
-    *,
-    with_error: bool,
+    now: RecordingStatus, result: Result, choice: Choice, *, with_error: bool
 ) -> dict[str, list[Cell]]:
     """Return the columns of channels, by their titles."""
     snapshot = result.snapshot
     band, of_sensor = result.band, _columns_of(snapshot)
     titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
-    columns, alone = {}, result.alone
+    columns, means = {}, noise_in_band(result, choice)
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
         cells = columns[title] = [Cell("") for _ in now.sensors]
@@ -113,7 +107,7 @@ def _noise_columns(
             mine = of_sensor.get(sensor.name, [])
             if number < len(mine):
                 column = mine[number]
-                text, tone = _channel_noise(snapshot, column, means, alone, with_error=with_error)
+                text, tone = _channel_noise(result, column, means, with_error=with_error)
                 cells[row] = Cell(text, tone, chosen=column == choice.channel)
     return columns
 
@@ -157,19 +151,14 @@ def state(sensor: SensorStatus) -> Cell:
 
 
 def _channel_noise(
-    snapshot: Snapshot,
-    column: int,
-    means: Sequence[BandMeans],
-    alone: Mapping[int, WithoutPartner],
-    *,
-    with_error: bool,
+    result: Result, column: int, means: Sequence[BandMeans], *, with_error: bool
 ) -> tuple[str, Tone]:
-    name = snapshot.channels[column].channel
+    name = result.snapshot.channels[column].channel
     value = "…"
-    if flag := _flagged(snapshot, column):
+    if flag := _flagged(result.snapshot, column):
         return f"{name} {flag}", "bad"
-    if column in alone:
-        return f"{name} {PARTNER_WORDS[alone[column]]}", "bad"
+    if column in result.alone:
+        return f"{name} {PARTNER_WORDS[result.alone[column]]}", "bad"
     if means:
         mean, high, low = (
             float(each[0]) for each in (means[column].mean, means[column].high, means[column].low)

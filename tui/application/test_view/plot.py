@@ -14,7 +14,7 @@ from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.curves import Curve, DrawnLine, level_limits
-from tui.application.test_view.units import SpectrumUnit
+from tui.application.test_view.units import SpectrumUnit, log_ticks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,13 +38,7 @@ class FrequencyAxis(AxisFormatter):
 
     def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
         """Return tick positions in log10 of Hz."""
-        decades = range(math.floor(min_), math.ceil(max_) + 1)
-        for digits in ((1, 2, 5), (1, 3), (1,)):
-            ticks = [decade + math.log10(digit) for decade in decades for digit in digits]
-            ticks = [tick for tick in ticks if min_ <= tick <= max_]
-            if len(ticks) <= max_ticks:
-                break
-        return ticks
+        return log_ticks(min_, max_, max_ticks)
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
         """Return frequencies in Hz."""
@@ -54,8 +48,7 @@ class FrequencyAxis(AxisFormatter):
 class LevelAxis(AxisFormatter):
     """Ticks at round values of a unit, on an axis in dB."""
 
-    def __init__(self) -> None:
-        self.unit = SpectrumUnit("dB", is_db=True)
+    unit = SpectrumUnit("dB", is_db=True)
 
     def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
         """Return tick positions in dB."""

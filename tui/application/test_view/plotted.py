@@ -11,13 +11,18 @@ import numpy as np
 from daq.results.decision.limits import concerns, mask_psd
 from estimator.levels.bands import log_edges
 from tui.application.test_view.clocks import COLOURS
-from tui.application.test_view.curves import Curve, data_curve, mask_curve, noise_curve
+from tui.application.test_view.curves import (
+    Curve,
+    data_curve,
+    mask_curve,
+    model_curves,
+    noise_curve,
+)
 from tui.application.test_view.units import SpectrumUnit, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.bench.masks.mask import Mask
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
     from tui.application.state import State
@@ -30,7 +35,6 @@ NARROWEST = 0.02  # of a decade
 DATA_STYLE = "#7d8799"
 LIMITS = (("#ff6b6b", "■"), ("#ff9f43", "□"), ("#ff6bb5", "▣"), ("#e0e04c", "▢"))
 """Colour and marker of each limit of a bench file, in turn."""
-MODEL_STYLE, MODEL_MARKERS = "#aab4be", "▽△◇○"
 MARKERS = "●×◆+■▲"
 REFERENCE_STYLE = ("#7bd88f", "#3f6d4b", "≈")
 STYLES = {
@@ -125,9 +129,8 @@ def stepped(choice: Choice, snapshot: Snapshot, *, channel: int = 0, sensor: int
     """Return a choice of another channel, or of the like channel of another sensor."""
     if channel:
         return replace(choice, channel=(choice.channel + channel) % len(snapshot.channels))
-    starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
-    now = max(n for n, start in enumerate(starts) if start <= choice.channel)
-    place, other = choice.channel - starts[now], (now + sensor) % len(starts)
+    starts, now, place = _place(choice, snapshot)
+    other = (now + sensor) % len(starts)
     return replace(choice, channel=starts[other] + min(place, snapshot.dims[other] - 1))
 
 
@@ -144,10 +147,15 @@ def picking(choice: Choice) -> Choice:
 
 def _like_channels(choice: Choice, snapshot: Snapshot) -> list[int]:
     """Return the channels at the place that the chosen one has in its sensor, of every sensor."""
+    starts, _, place = _place(choice, snapshot)
+    return [start + place for start, d in zip(starts, snapshot.dims, strict=True) if place < d]
+
+
+def _place(choice: Choice, snapshot: Snapshot) -> tuple[list[int], int, int]:
+    """Return the first channel of every sensor, and sensor and place in it of the chosen one."""
     starts = [sum(snapshot.dims[:n]) for n in range(len(snapshot.dims))]
     now = max(n for n, start in enumerate(starts) if start <= choice.channel)
-    place = choice.channel - starts[now]
-    return [start + place for start, d in zip(starts, snapshot.dims, strict=True) if place < d]
+    return starts, now, choice.channel - starts[now]
 
 
 def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
@@ -164,15 +172,14 @@ def curves(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         first, last = whole_span(snapshot)
         n_points = round(n_points * (last - first) / (choice.span[1] - choice.span[0]))
     column, frequency = choice.channel, snapshot.frequency
+    models = model_curves(state.models, frequency, snapshot.unit, n_points=n_points)
+    limits = _limits(state, choice, n_points=n_points)
     if compared := compared_channels(choice, snapshot):
-        masks = _models(state, n_points=n_points) + _limits(state, choice, n_points=n_points)
-        return masks + _compared(state, choice, compared, n_points=n_points)
+        return models + limits + _compared(state, choice, compared, n_points=n_points)
     shown = [
         data_curve(frequency, snapshot.data_psd[:, column], n_points=n_points, style=DATA_STYLE)
     ]
-    shown += _models(state, n_points=n_points)
-    shown += _reference(state, choice, n_points=n_points)
-    shown += _limits(state, choice, n_points=n_points)
+    shown += models + _reference(state, choice, n_points=n_points) + limits
     for method in choice.methods:
         if method in snapshot.results:
             shown.append(
@@ -259,8 +266,8 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
     return [
         mask_curve(
             frequency,
+            limit.mask,
             mask_psd(bench, limit, label, frequency[1:]),
-            span=(limit.mask.frequency[0], limit.mask.frequency[-1]),
             n_points=n_points,
             label=limit.name,
             style=LIMITS[number % len(LIMITS)][0],
@@ -269,31 +276,6 @@ def _limits(state: State, choice: Choice, *, n_points: int) -> list[Curve]:
         for number, limit in enumerate(bench.limits)
         if concerns(limit, label)
     ]
-
-
-def _models(state: State, *, n_points: int) -> list[Curve]:
-    """Return the noise models that were asked for, where they reach into the spectrum."""
-    snapshot = state.snapshot
-    if snapshot is None:
-        return []
-    frequency = snapshot.frequency
-    return [
-        mask_curve(
-            frequency,
-            model.at(np.clip(frequency[1:], *_ends(model)), snapshot.unit),
-            span=_ends(model),
-            n_points=n_points,
-            label=model.name,
-            style=MODEL_STYLE,
-            marker=MODEL_MARKERS[number % len(MODEL_MARKERS)],
-        )
-        for number, model in enumerate(state.models)
-        if _ends(model)[0] < frequency[-1] and _ends(model)[1] > frequency[1]
-    ]
-
-
-def _ends(mask: Mask) -> tuple[float, float]:
-    return mask.frequency[0], mask.frequency[-1]
 
 
 def plot_title(snapshot: Snapshot, choice: Choice) -> str:

@@ -57,24 +57,25 @@ class SpectrumUnit:
         per_decade = 20 if self.is_amplitude else 10
         offset = per_decade * math.log10(self.scale)
         low, high = (low_db + offset) / per_decade, (high_db + offset) / per_decade
-        for digits, skip in (((1, 2, 5), 1), ((1, 3), 1), ((1,), 1), ((1,), 2), ((1,), 4)):
-            decades = range(math.floor(low), math.ceil(high) + 1)
-            ticks = [
-                decade + math.log10(digit)
-                for decade in decades
-                if decade % skip == 0
-                for digit in digits
-            ]
-            ticks = [tick for tick in ticks if low <= tick <= high]
-            if len(ticks) <= most:
-                break
-        return [per_decade * tick - offset for tick in ticks]
+        return [per_decade * tick - offset for tick in log_ticks(low, high, most)]
 
     def labels(self, ticks: Sequence[float]) -> list[str]:
         """Return the labels of ticks."""
         if self.is_db:
             return [f"{tick:.0f} dB".replace("-", "−") for tick in ticks]
         return [f"{float(f'{self.value(tick):.1g}'):.4g}" for tick in ticks]
+
+
+def log_ticks(low: float, high: float, most: int) -> list[float]:
+    """Return log10 of round numbers between two ends: decades, and with room 2 and 5 or 3."""
+    for digits, skip in (((1, 2, 5), 1), ((1, 3), 1), ((1,), 1), ((1,), 2), ((1,), 4)):
+        first, last = math.floor(low), math.ceil(high) + 1
+        decades = range(first + -first % skip, last, skip)
+        ticks = [decade + math.log10(digit) for decade in decades for digit in digits]
+        ticks = [tick for tick in ticks if low <= tick <= high]
+        if len(ticks) <= most:
+            break
+    return ticks
 
 
 def units_of(unit: str) -> tuple[SpectrumUnit, ...]:

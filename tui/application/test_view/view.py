@@ -28,19 +28,8 @@ if TYPE_CHECKING:
 
 
 SNAPSHOT_ACTIONS = {
-    *(
-        "channel",
-        "sensor",
-        "method",
-        "clocks",
-        "unit",
-        "table",
-        "overlay",
-        "bins",
-        "pick",
-        "freeze",
-    ),
-    *("cursor", "zoom", "pan", "whole"),
+    *("channel", "sensor", "method", "clocks", "unit", "table", "overlay", "bins", "pick"),
+    *("freeze", "cursor", "zoom", "pan", "whole"),
 }
 """What can be done once there is an estimate."""
 
@@ -218,8 +207,7 @@ class TestView(View):
 
     def action_clocks(self) -> None:
         """Show clocks in place of noise, or noise again."""
-        if self.state.snapshot is not None:
-            self.choice = replace(self.choice, clocks=not self.choice.clocks)
+        self.choice = replace(self.choice, clocks=not self.choice.clocks)
 
     def action_details(self) -> None:
         """Show all that is known of the test."""
