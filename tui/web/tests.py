@@ -104,34 +104,20 @@ class Tests:
         ]
         return FoundTests(tuple(found[first : first + PAGE]), len(found))
 
-    def path_of(self, name: str) -> Path:
-        """Return the recording of a name that a request gives.
-
-        Raises
-        ------
-        NoSuchTestError
-            If there is none in the folder of the bench.
-        """
-        folder = self._controls.folder
-        path = next((each for each in folder.glob("*.h5") if each.name == name), None)
-        if path is None or not path.is_file():
-            raise NoSuchTestError(f"{name}: no such test")
-        return path
-
-    def is_running(self, path: Path) -> bool:
-        """Return whether a recording is still being written, or followed to its end."""
-        return path == self._followed() or is_being_written(path)
-
     def key_of(self, name: str) -> Key:
         """Return what is the same for a test as long as its recording is.
 
         Raises
         ------
         NoSuchTestError
-            If there is no such test, or it is still being recorded.
+            If there is no such test in the folder of the bench, or it is still being recorded, or
+            followed to its end.
         """
-        path = self.path_of(name)
-        if self.is_running(path):
+        folder = self._controls.folder
+        path = next((each for each in folder.glob("*.h5") if each.name == name), None)
+        if path is None or not path.is_file():
+            raise NoSuchTestError(f"{name}: no such test")
+        if path == self._followed() or is_being_written(path):
             raise NoSuchTestError(f"{name} is still being recorded: its result follows at its end")
         about = path.stat()
         return path, about.st_mtime_ns, about.st_size

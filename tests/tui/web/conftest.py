@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import shutil
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
 
-from tests.tui.web.pages import Server, bench_file, serving
+from tests.tui.web.pages import OLD_KEY, SECRETS, Server, bench_file, serving
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from playwright.sync_api import Browser, Page
+
+    Barriers: TypeAlias = Callable[[Page], list[tuple[str, str]]]
 
 CHROMIUM = os.environ.get("HUDDLE_CHROMIUM") or shutil.which("chromium")
 SIZES = {"desk": (1280, 900), "phone": (390, 844)}
@@ -31,6 +33,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(folder: Path) -> Iterator[Server]:
     """Serve without secrets, on this computer."""
     with serving(bench_file(folder)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Serve with secrets, where an earlier version left its key."""
+    folder = tmp_path_factory.mktemp("closed")
+    bench = bench_file(folder, SECRETS)
+    (folder / OLD_KEY).write_bytes(b"x" * 32)
+    with serving(bench) as found:
         yield found
 
 
@@ -63,6 +75,18 @@ def wrong() -> Iterator[list[str]]:
     found: list[str] = []
     yield found
     assert found == []
+
+
+@pytest.fixture(scope="session")
+def barriers() -> Barriers:
+    """Return what finds the barriers of a page, each with its element; skip where nothing does."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+
+    def found(page: Page) -> list[tuple[str, str]]:
+        violations = axe.run(page).response["violations"]
+        return [(each["id"], each["nodes"][0]["html"]) for each in violations]
+
+    return found
 
 
 def opened(browser: Browser, wrong: list[str], size: str = "desk", *, script: bool = True) -> Page:

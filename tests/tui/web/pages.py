@@ -39,6 +39,7 @@ SECRETS = f"""
 read = "{token_hash(READER)}"
 steer = "{STEERER_HASH}"
 """
+OLD_KEY = "recordings/.cellar--b-.web-key"
 
 
 def bench_file(folder: Path, web: str = "") -> Path:
@@ -116,9 +117,12 @@ class Server:
         except FileNotFoundError:
             return None
 
-    def visit(self) -> Visit:
-        """Return somebody new."""
-        return Visit(self.url.rstrip("/"))
+    def visit(self, secret: str = "", name: str = "Ada") -> Visit:
+        """Return somebody new, who logs in with a secret if one is given."""
+        found = Visit(self.url.rstrip("/"))
+        if secret:
+            found.log_in(secret, name)
+        return found
 
 
 @contextmanager

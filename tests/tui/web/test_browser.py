@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Browser, Page
 
+    from tests.tui.web.conftest import Barriers
+
 pytestmark = pytest.mark.usefixtures("chromium")  # no server where there is none
 PAGES = {"/": "Now", "/tests": "Tests", "/tests/night.h5": "night", "/login": "Log in"}
 DRAWN = "#chart[data-drawn]"
@@ -25,9 +27,8 @@ DRAWN = "#chart[data-drawn]"
 
 @pytest.mark.parametrize("size", SIZES)
 def test_every_page_fits_and_has_no_barrier(
-    server: Server, browser: Browser, wrong: list[str], size: str
+    server: Server, browser: Browser, wrong: list[str], size: str, barriers: Barriers
 ) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page = opened(browser, wrong, size)
     for path, title in PAGES.items():
         page.goto(server.url.rstrip("/") + path)
@@ -35,8 +36,7 @@ def test_every_page_fits_and_has_no_barrier(
         if path == "/tests/night.h5":
             page.wait_for_selector(DRAWN)
         assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
-        found = axe.run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+        assert barriers(page) == []
 
 
 def test_a_page_without_script_is_whole(server: Server, browser: Browser, wrong: list[str]) -> None:
@@ -134,9 +134,12 @@ def test_a_wrong_password_is_refused_and_a_right_one_leads_on(
 
 @pytest.mark.parametrize("asked", ["light", "dark"])
 def test_pages_follow_the_system_and_a_choice_is_kept(
-    server: Server, browser: Browser, wrong: list[str], asked: Literal["light", "dark"]
+    server: Server,
+    browser: Browser,
+    wrong: list[str],
+    asked: Literal["light", "dark"],
+    barriers: Barriers,
 ) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page = opened(browser, wrong, "phone")
     page.emulate_media(color_scheme=asked)
     back = "getComputedStyle(document.body).backgroundColor"
@@ -144,8 +147,7 @@ def test_pages_follow_the_system_and_a_choice_is_kept(
     for _ in range(2):
         page.goto(f"{server.url}tests")
         found.append(page.evaluate(back))
-        violations = axe.run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in violations] == []
+        assert barriers(page) == []
         page.locator("#theme").click()
     light, dark = "rgb(255, 255, 255)", "rgb(17, 21, 28)"
     assert found == ([light, dark] if asked == "light" else [dark, light])

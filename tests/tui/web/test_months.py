@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Browser
 
+    from tests.tui.web.conftest import Barriers
+
 FIRST = datetime(2026, 1, 1, tzinfo=UTC)
 NAME = "A<img src=x>"
 
@@ -71,13 +73,11 @@ def test_the_archive_has_tables_and_pictures(server: Server) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_pages_of_months_fit_and_have_no_barrier(
-    server: Server, browser: Browser, wrong: list[str], size: str
+    server: Server, browser: Browser, wrong: list[str], size: str, barriers: Barriers
 ) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page = opened(browser, wrong, size)
     for path in ("sensors", "archive"):
         page.goto(server.url + path)
         assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
         assert all(page.evaluate("[...document.images].map((each) => each.naturalWidth)"))
-        found = axe.run(page).response["violations"]
-        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+        assert barriers(page) == []

@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import pytest
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from playwright.sync_api import Browser, Page
 
+    from tests.tui.web.conftest import Barriers
+
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals"),
@@ -39,17 +41,15 @@ def bench(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_test_is_started_seen_marked_and_stopped(
-    bench: Path, browser: Browser, wrong: list[str]
+    bench: Path, browser: Browser, wrong: list[str], barriers: Barriers
 ) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     with serving(bench) as server:
-        looks = server.visit()
-        looks.log_in(READER)
+        looks = server.visit(READER)
         page = opened(browser, wrong)
         _log_in(page, server)
         assert "No test is running." in page.locator("#state").inner_text()
         page.locator("a:text('Start a test')").click()
-        assert _barriers(page, axe) == []
+        assert barriers(page) == []
         page.locator("input[name=operator]").fill("Ada <i>")
         page.locator("input[name=duration]").fill("")
         page.locator("main button").click()
@@ -60,13 +60,13 @@ def test_a_test_is_started_seen_marked_and_stopped(
         assert "Hz, dB re 1 (m/s²)²/Hz" in page.locator("#noise h2").inner_text()
         assert page.locator(".traces li").count() == 9
         assert page.locator("#state >> text=SIMULATED").is_visible()
-        assert _barriers(page, axe) == []
+        assert barriers(page) == []
         page.set_viewport_size({"width": SIZES["phone"][0], "height": SIZES["phone"][1]})
         wait_until(
             lambda: page.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0],
             "the chart has the width of a phone",
         )
-        assert _barriers(page, axe) == []
+        assert barriers(page) == []
         before = page.locator("#at").inner_text()
         wait_until(lambda: page.locator("#at").inner_text() != before, "the page goes on")
 
@@ -76,7 +76,7 @@ def test_a_test_is_started_seen_marked_and_stopped(
         page.locator("button:text('Mark')").click()
         page.wait_for_selector("#events >> text=door <b>slammed</b> (Ada, 127.0.0.1)")
         page.locator("a:text('Stop the test')").click()
-        assert _barriers(page, axe) == []
+        assert barriers(page) == []
         page.locator("main button").click()
         page.wait_for_selector("#state >> text=its result")
         page.locator("#state a").click()
@@ -97,10 +97,6 @@ def test_a_test_is_started_seen_marked_and_stopped(
         "door <b>slammed</b>",
         "stopped in the browser by Ada",
     ]
-
-
-def _barriers(page: Page, axe: Any) -> list[str]:  # noqa: ANN401 - it has no types
-    return [each["id"] for each in axe.run(page).response["violations"]]
 
 
 def _log_in(page: Page, server: Server) -> None:

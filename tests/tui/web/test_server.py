@@ -14,7 +14,6 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from urllib.parse import urlencode, urlsplit
@@ -56,13 +55,6 @@ HEADERS = {
     "referrer-policy": "same-origin",
     "cache-control": "no-store",
 }
-
-
-@pytest.fixture(scope="module")
-def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Serve with secrets, which nobody tries to guess."""
-    with serving(bench_file(tmp_path_factory.mktemp("closed"), SECRETS)) as found:
-        yield found
 
 
 @pytest.mark.parametrize(
@@ -256,8 +248,7 @@ def test_who_looks_does_not_steer(closed: Server) -> None:
 
 
 def test_forms_of_other_sites_do_nothing(closed: Server) -> None:
-    visit = closed.visit()
-    visit.log_in(STEERER)
+    visit = closed.visit(STEERER)
     (token,) = set(re.findall(r'name="token" value="(\w+)"', visit.get("/start").text))
     for form in ({}, {"token": ""}, {"token": token[:-1] + "x"}, {"token": "٣"}):
         assert visit.post("/mark", form | {"text": "x"}).status == 403
@@ -265,14 +256,12 @@ def test_forms_of_other_sites_do_nothing(closed: Server) -> None:
     assert wrong.status == 403
     right = visit.post("/mark", {"token": token, "text": "x"}, Origin=closed.url.rstrip("/"))
     assert (right.status, "no test is running" in right.text) == (404, True)
-    other = closed.visit()
-    other.log_in(STEERER, name="Bob")
+    other = closed.visit(STEERER, name="Bob")
     assert other.post("/mark", {"token": token, "text": "x"}).status == 403
 
 
 def test_a_test_that_fails_its_check_list_waits_for_a_confirmation(closed: Server) -> None:
-    visit = closed.visit()
-    visit.log_in(STEERER)
+    visit = closed.visit(STEERER)
     (token,) = set(re.findall(r'name="token" value="(\w+)"', visit.get("/start").text))
     found = visit.post("/start", {"token": token, "duration": "1h"})
     assert found.status == 409
@@ -303,9 +292,7 @@ def test_a_token_may_be_in_the_environment(tmp_path: Path, monkeypatch: pytest.M
 def test_visits_last_over_a_restart_and_end_with_a_log_out_or_the_secret(tmp_path: Path) -> None:
     bench = bench_file(tmp_path, SECRETS)
     with serving(bench) as first:
-        visit, left = first.visit(), first.visit()
-        visit.log_in(READER)
-        left.log_in(READER)
+        visit, left = first.visit(READER), first.visit(READER)
         (token,) = set(re.findall(r'name="token" value="(\w+)"', left.get("/tests").text))
         assert left.post("/logout", {"token": token}).status == 303
         assert left.get("/tests").status == 303  # the same cookie

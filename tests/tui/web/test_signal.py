@@ -21,6 +21,8 @@ from tui.web.signal import png
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+    from tests.tui.web.conftest import Barriers
+
 PAGE = "tests/night.h5/signal"
 START = 1_468_458_000.0
 
@@ -78,15 +80,13 @@ def test_the_png_is_one() -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_it_fits_and_has_no_barrier(
-    server: Server, browser: Browser, wrong: list[str], size: str
+    server: Server, browser: Browser, wrong: list[str], size: str, barriers: Barriers
 ) -> None:
     """On a desk and a phone."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     page = opened(browser, wrong, size)
     page.goto(server.url + PAGE)
     assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
-    found = axe.run(page).response["violations"]
-    assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+    assert barriers(page) == []
 
 
 def test_wheel_drag_and_keys(server: Server, browser: Browser, wrong: list[str]) -> None:

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import TypeAlias, cast
 from urllib.parse import urlsplit
 
 import pytest
@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from daq.bench.tables.unattended import Web
 from daq.devices.bench_file import load
-from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
+from tests.tui.web.pages import OLD_KEY, READER, SECRETS, STEERER, Server, bench_file, serving
 from tests.tui.web.strangers import fuzzed
 from tests.waiting import limit, wait_until
 from tui.application.controls import Controls
@@ -35,19 +35,8 @@ from tui.web.tests import Tests
 from tui.web.work import WAITING, LeftError, TooMuchWorkError, Work, WorkPiece, check_wanted
 
 resource = pytest.importorskip("resource", reason="limits of descriptors")
-OLD_KEY = "recordings/.cellar--b-.web-key"
 OPEN = {"/login"}
 """The addresses that need no right; nothing else is shown to who has not logged in."""
-
-
-@pytest.fixture(scope="module")
-def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Serve with secrets, where an earlier version left its key."""
-    folder = tmp_path_factory.mktemp("strangers")
-    bench = bench_file(folder, SECRETS)
-    (folder / OLD_KEY).write_bytes(b"x" * 32)
-    with serving(bench) as found:
-        yield found
 
 
 def raw(server: Server, sent: bytes) -> bytes:
@@ -95,8 +84,7 @@ def hold(stack: ExitStack, server: Server, n: int, said: Sequence[str] = SAID) -
 
 @pytest.mark.parametrize("said", SAID)
 def test_a_visitor_works_on_while_others_hold_connections(closed: Server, said: str) -> None:
-    visit = closed.visit()
-    visit.log_in(READER)
+    visit = closed.visit(READER)
     with ExitStack() as stack:
         for _ in range(4):
             hold(stack, closed, OF_ADDRESS // 2, [said])
@@ -118,8 +106,7 @@ def test_fifteen_hundred_connections_do_not_delay_a_visitor(tmp_path: Path) -> N
             serving(bench_file(tmp_path, SECRETS), descriptors=1024) as server,
             ExitStack() as stack,
         ):
-            visit = server.visit()
-            visit.log_in(READER)
+            visit = server.visit(READER)
             hold(stack, server, 1500)
             visit.get("/tests")  # the burst has been accepted
             seconds = []
@@ -167,8 +154,11 @@ class Clock:
         return self.now
 
 
+Pairs: TypeAlias = list[tuple[socket.socket, socket.socket]]
+
+
 @pytest.fixture
-def pairs() -> Iterator[list[tuple[socket.socket, socket.socket]]]:
+def pairs() -> Iterator[Pairs]:
     """Yield a dozen connections: this side, and that of the peer."""
     with ExitStack() as stack:
         found = [socket.socketpair() for _ in range(12)]
@@ -187,9 +177,7 @@ def ended(peer: socket.socket) -> bool:
         return False
 
 
-def test_the_longest_idle_connection_of_an_address_gives_way(
-    pairs: list[tuple[socket.socket, socket.socket]],
-) -> None:
+def test_the_longest_idle_connection_of_an_address_gives_way(pairs: Pairs) -> None:
     known = Connections(total=10, of_address=3, now=Clock())
     for own, _ in pairs[:3]:
         assert known.admit(own, "a")
@@ -207,9 +195,7 @@ def test_the_longest_idle_connection_of_an_address_gives_way(
     assert [ended(peer) for _, peer in pairs[:4]] == [False, True, True, False]
 
 
-def test_all_addresses_that_one_person_has_are_one(
-    pairs: list[tuple[socket.socket, socket.socket]],
-) -> None:
+def test_all_addresses_that_one_person_has_are_one(pairs: Pairs) -> None:
     known = Connections(total=20, of_address=3, trusted=["2001:db8::9"], now=Clock())
     for n in range(4):
         assert known.admit(pairs[n][0], f"2001:db8::{n}")
@@ -218,9 +204,7 @@ def test_all_addresses_that_one_person_has_are_one(
     assert [ended(peer) for _, peer in pairs] == [True, *[False] * 11]
 
 
-def test_in_total_there_are_no_more_connections_than_the_process_may_hold(
-    pairs: list[tuple[socket.socket, socket.socket]],
-) -> None:
+def test_in_total_there_are_no_more_connections_than_the_process_may_hold(pairs: Pairs) -> None:
     known = Connections(total=4, of_address=3, trusted=["proxy"], now=Clock())
     for number, (own, _) in enumerate(pairs):
         assert known.admit(own, "proxy" if number % 2 else str(number))
@@ -228,9 +212,7 @@ def test_in_total_there_are_no_more_connections_than_the_process_may_hold(
     assert sum(ended(peer) for _, peer in pairs) == 8
 
 
-def test_a_connection_has_so_long_for_a_head_and_for_reading(
-    pairs: list[tuple[socket.socket, socket.socket]],
-) -> None:
+def test_a_connection_has_so_long_for_a_head_and_for_reading(pairs: Pairs) -> None:
     clock = Clock()
     known = Connections(total=10, now=clock)
     for own, _ in pairs[:3]:
@@ -255,8 +237,7 @@ def test_every_address_states_a_right_and_is_denied_without_it(closed: Server) -
     table = Pages.__new__(Pages).routes
     assert {path for path, right, *_ in table if right is None} == OPEN
     assert {right for _, right, *_ in table} == {None, Right.READ, Right.STEER}
-    looks = closed.visit()
-    looks.log_in(READER)
+    looks = closed.visit(READER)
     for path, right, _, methods in table:
         address = path.replace("{name}", "night.h5").replace("{number}", "0")
         for method in methods.split():
@@ -338,8 +319,7 @@ def test_no_request_of_many_is_an_error_of_the_server(tmp_path: Path, web: str, 
 
 
 def _fuzz(server: Server, n: int) -> None:
-    visit = server.visit()
-    visit.log_in(STEERER)
+    visit = server.visit(STEERER)
     statuses = fuzzed(server, visit.headers.get("Cookie", ""), n, seed=1)
     print(statuses)
     assert not any(status >= 500 for status in statuses), statuses
@@ -433,11 +413,13 @@ def test_abandoned_reports_hold_up_nobody(server: Server) -> None:
 
 
 class Busy:
-    """Work that lasts until it is let go."""
+    """Work that lasts until it is let go; a visitor has begun with ``running``."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: str) -> None:
         self.work, self.go = Work("test"), threading.Event()
         self.done: list[str] = []
+        self.running = self.ask(first, "running")
+        wait_until(lambda: not self.work._queues, "the first has begun")  # noqa: SLF001
 
     def ask(self, visitor: str, key: str) -> WorkPiece:
         """Ask for work that notes its key."""
@@ -456,9 +438,7 @@ class Busy:
 
 
 def test_visitors_are_served_in_turn_and_wait_for_few_pieces() -> None:
-    busy = Busy()
-    busy.ask("first", "running")
-    wait_until(lambda: not busy.work._queues, "the first has begun")  # noqa: SLF001
+    busy = Busy("first")
     for n in range(WAITING):
         busy.ask("greedy", f"g{n}")
     with pytest.raises(TooMuchWorkError, match="4 pages wait"):
@@ -469,14 +449,12 @@ def test_visitors_are_served_in_turn_and_wait_for_few_pieces() -> None:
 
 
 def test_work_that_nobody_waits_for_is_dropped_and_results_are_kept() -> None:
-    busy = Busy()
-    running = busy.ask("a", "running")
-    wait_until(lambda: not busy.work._queues, "the first has begun")  # noqa: SLF001
+    busy = Busy("a")
     left, shared = busy.ask("a", "left"), busy.ask("a", "shared")
     assert busy.ask("b", "shared") is shared
     busy.work.leave(left)
     busy.work.leave(shared)
-    busy.work.leave(running)
+    busy.work.leave(busy.running)
     busy.finish(2)
     assert busy.done == ["running", "shared"]
     assert busy.ask("c", "shared") is shared
