@@ -28,7 +28,7 @@ from tests.acceptance.run_bench import command, served
 from tests.acceptance.sample_accounting import Account, Log, accounts
 from tui.commands.demo import compare
 from tui.simulation.devices import scenario_of
-from tui.wording.formatting import interval, level
+from tui.wording.formatting import level
 
 BEGIN = 30.0
 """World time of the first fault, s."""
@@ -95,7 +95,7 @@ def _estimate(screen: Console, bench: Bench, out: Path) -> int:
             f"{one.sensor}.{one.channel}",
             level(one.true_noise_psd),
             level(one.noise_psd),
-            interval(one.noise_psd_low, one.noise_psd_high),
+            f"{level(one.noise_psd_low)} … {level(one.noise_psd_high)}",
             "yes" if one.covers else "NO",
         )
     screen.print(table)

@@ -7,7 +7,7 @@ docs/json.md describes it for people, ``tui/resources/result-2.schema.json`` for
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from daq.bench.estimate_settings import table_keys
@@ -24,6 +24,7 @@ from tui import __version__
 from tui.output.calibration import channels_of
 from tui.output.json_values import json_text, label_document, plain
 from tui.output.noise_parameters import noise_parameters_document
+from tui.wording.formatting import utc
 from tui.wording.verdict_text import Decision
 
 if TYPE_CHECKING:
@@ -121,8 +122,8 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
     return {
         "title": "Self-noise of sensors, from a huddle test",
         "source": f"huddle-bench {__version__}",
-        "time_coverage_start": _instant(start_ns),
-        "time_coverage_end": _instant(start_ns + round(snapshot.elapsed * 1e9)),
+        "time_coverage_start": utc(start_ns, 9),
+        "time_coverage_end": utc(start_ns + round(snapshot.elapsed * 1e9), 9),
         "history": f"estimated by huddle-bench {__version__}",
         "confidence_of_intervals": "0.95",
         "unit_of_densities": f"({snapshot.unit})²/Hz",
@@ -133,11 +134,6 @@ def provenance(result: Result, *, with_recordings: bool = True) -> dict[str, str
         "settings": json.dumps(_settings(result), ensure_ascii=False),
         "recordings": json.dumps(recordings, ensure_ascii=False),
     }
-
-
-def _instant(utc_ns: int) -> str:
-    whole, rest = divmod(utc_ns, 1_000_000_000)
-    return f"{datetime.fromtimestamp(whole, tz=UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
 def _recording(source: Source) -> RecordingDocument:

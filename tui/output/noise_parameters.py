@@ -43,11 +43,6 @@ OUTCOMES = {
     SheetOutcome.NOT_DECIDED: "not decided",
     SheetOutcome.UNKNOWN: "no estimate",
 }
-QUANTITIES = {
-    SheetQuantity.NOISE_DENSITY: "noise density",
-    SheetQuantity.INTEGRATED_NOISE: "integrated noise",
-    SheetQuantity.DYNAMIC_RANGE: "dynamic range",
-}
 MAX_TIMES = 5
 """Averaging times in the table of Allan deviations: what a terminal is wide."""
 
@@ -104,7 +99,7 @@ def sheet_table(found: Sequence[ChannelParameters]) -> Table:
     rows = [
         (
             each.label.name,
-            f"{QUANTITIES[one.quantity]}, {one.unit}",
+            f"{one.quantity.replace('-', ' ')}, {one.unit}",
             _where(one),
             f"{one.stated:.4g}",
             _number(one.measured),

@@ -12,16 +12,20 @@ from tui.page.drawing import DARK, LIGHT
 from tui.page.html import html
 
 
-def page(report: Report) -> str:
-    """Return a report as HTML, with all text escaped and plots inline as SVG."""
-    environment = Environment(
-        loader=PackageLoader("tui.page", "."),
+def environment(package: str, folder: str = "templates") -> Environment:
+    """Return the templates of a package: undefined names are errors, and all text is escaped."""
+    return Environment(
+        loader=PackageLoader(package, folder),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+
+
+def page(report: Report) -> str:
+    """Return a report as HTML, with all text escaped and plots inline as SVG."""
     numbers = count(1)
 
     def parts_of(section: Section) -> Markup:
@@ -29,7 +33,7 @@ def page(report: Report) -> str:
         return Markup("\n".join(parts))  # noqa: S704 - the renderer escapes all text
 
     foot = f"{report.number}   {report.subtitle}" if report.number else report.subtitle
-    template = environment.get_template("page.html.j2")
+    template = environment("tui.page", ".").get_template("page.html.j2")
     return template.render(
         report=report, light=LIGHT, dark=DARK, footer=_css_string(foot), parts_of=parts_of
     )

@@ -5,27 +5,22 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from functools import cache
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 
 from estimator.wording import clock_time, several
 from tui.page.blocks import Paragraph, Part
 from tui.page.html import html
+from tui.page.html_page import environment
 from tui.page.table import tone_of
 from tui.wording.formatting import utc
 from tui.wording.verdict_text import TONES
 
 
 @cache
-def environment() -> Environment:
-    """Return the templates: undefined names are errors, and all text is escaped."""
-    made = Environment(
-        loader=PackageLoader("tui.web"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+def templates() -> Environment:
+    """Return the templates of the pages."""
+    made = environment("tui.web")
     made.filters |= {
         "block": block,
         "clock_time": clock_time,
@@ -40,7 +35,7 @@ def environment() -> Environment:
 
 def page(name: str, /, **values: object) -> str:
     """Return a page, or a part of one."""
-    return environment().get_template(f"{name}.html.j2").render(values)
+    return templates().get_template(f"{name}.html.j2").render(values)
 
 
 def instant(at: datetime, form: str = "%H:%M:%S UTC", text: str = "") -> Markup:

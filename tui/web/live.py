@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -48,7 +47,6 @@ from tui.web.html import instant, page
 from tui.web.traces import WebTrace, traces
 from tui.wording.facts import RANK_TONES
 
-_LOGGER = logging.getLogger(__name__)
 LOOK = 1.0
 """Seconds between looks for a test that starts."""
 STATES_EVERY = 1.25

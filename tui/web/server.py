@@ -682,11 +682,10 @@ class Server:
         name = request.scope["path"].rpartition("/")[2].removesuffix(".png")
         months = self._months
 
-        def drawn() -> bytes:
-            return months.sensors_picture() if name == "sensors" else months.archive_picture(name)
-
+        of_archive = partial(months.archive_picture, name)
+        act = months.sensors_picture if name == "sensors" else of_archive
         try:
-            content = await self._made(request, self._tests.work, None, drawn)
+            content = await self._made(request, self._tests.work, None, act)
         except LookupError as error:
             raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
         return Response(content, media_type="image/png")

@@ -32,11 +32,11 @@ NOTHING = "?"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def utc(ns: int) -> str:
-    """Return an instant as ISO 8601 to the millisecond."""
+def utc(ns: int, digits: int = 3) -> str:
+    """Return an instant as ISO 8601 with so many digits of its second, usually milliseconds."""
     whole, rest = divmod(ns, 1_000_000_000)
     moment = datetime.fromtimestamp(whole, tz=UTC)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z"
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{f'{rest:09d}'[:digits]}Z"
 
 
 def level(psd: float, digits: int = 2) -> str:
@@ -82,15 +82,6 @@ def _width(psd: float, high: float, low: float, *, short: bool) -> str:
     if down < ONE_SIDED * up:
         return f" ±{up:.2f}"
     return f" ±{down:.2f}" if down < up + ONE_SIDED_DB else f" +{up:.2f} −{down:.2f}"
-
-
-def interval(low: float, high: float) -> str:
-    """Return an interval of PSD in dB."""
-    if math.isnan(high) or high <= 0:
-        return ""
-    if math.isinf(high):
-        return NOT_KNOWN
-    return f"… {level(high)}" if low <= 0 else f"{level(low)} … {level(high)}"
 
 
 def readings(values: Sequence[float], unit: str) -> tuple[list[str], str]:

@@ -33,6 +33,13 @@ def span(page: Page) -> tuple[float, float]:
     return float(begin) - START, float(end) - START
 
 
+def frame(page: Page) -> tuple[float, float, float]:
+    """Return left, top and width of the waveforms, beside their names."""
+    box = page.locator("svg.signal").bounding_box()
+    assert box is not None
+    return box["x"] + 0.11 * box["width"], box["y"], 0.89 * box["width"]
+
+
 def test_the_picture_has_every_channel_and_the_gap(server: Server) -> None:
     """As text of a vector graphic; names of sensors cannot write tags."""
     visit = Visit(server.url)
@@ -93,17 +100,15 @@ def test_wheel_drag_and_keys(server: Server, browser: Browser, wrong: list[str])
     """The picture follows; the address is that of what is seen."""
     page = opened(browser, wrong)
     page.goto(server.url + PAGE)
-    box = page.locator("svg.signal").bounding_box()
-    assert box is not None
-    left, width = box["x"] + 0.11 * box["width"], 0.89 * box["width"]
-    page.mouse.move(left + width / 2, box["y"] + 50)
+    left, top, width = frame(page)
+    page.mouse.move(left + width / 2, top + 50)
     page.mouse.wheel(0, -100)
     wait_until(lambda: span(page)[1] - span(page)[0] < 31, "it is zoomed")
     assert span(page) == pytest.approx((15, 45), abs=0.5)
     page.mouse.wheel(0, -100)
     wait_until(lambda: span(page)[1] - span(page)[0] < 16, "it is zoomed")
     page.mouse.down()
-    page.mouse.move(left + width / 4, box["y"] + 50, steps=4)
+    page.mouse.move(left + width / 4, top + 50, steps=4)
     page.mouse.up()
     wait_until(lambda: span(page)[0] > 26, "it is dragged")
     assert span(page) == pytest.approx((26.25, 41.25), abs=0.5)
@@ -134,13 +139,11 @@ def test_a_stretch_is_excluded_and_taken_back(
     """With Shift and the mouse, as text, or what is shown; the estimate and its result follow."""
     page = opened(browser, wrong)
     page.goto(server.url + PAGE)
-    box = page.locator("svg.signal").bounding_box()
-    assert box is not None
-    left, width = box["x"] + 0.11 * box["width"], 0.89 * box["width"]
+    left, top, width = frame(page)
     page.keyboard.down("Shift")
-    page.mouse.move(left + width / 3, box["y"] + 50)
+    page.mouse.move(left + width / 3, top + 50)
     page.mouse.down()
-    page.mouse.move(left + width / 2, box["y"] + 50, steps=4)
+    page.mouse.move(left + width / 2, top + 50, steps=4)
     page.mouse.up()
     page.keyboard.up("Shift")
     excluded = page.locator("li:has-text('excluded: by choice')")

@@ -333,13 +333,10 @@ class SignalView(View):
     def action_mark(self, step: int = 1) -> None:
         """Go to the next or previous mark."""
         at, marks = self._look.cursor, self._shown.marks
-        if at is None:
-            ahead = marks if step > 0 else marks[::-1]
-        else:
-            ahead = tuple(each for each in marks if (each - at) * step > 1e-3)
-            ahead = ahead if step > 0 else ahead[::-1]
-        if ahead:
-            self._show(ahead[0])
+        for each in marks if step > 0 else reversed(marks):
+            if at is None or (each - at) * step > 1e-3:
+                self._show(each)
+                return
 
     def _show(self, time: float) -> None:
         """Place the cursor at a time, in its middle if it is not seen."""

@@ -59,14 +59,10 @@ def _verdict(result: Result) -> Cell:
         return Cell("effect not known yet", "quiet")
     worst = max(shares)
     if worst < NO_EFFECT:
-        words = f"no effect on noise ({percent(worst)})"
-    elif worst < NEGLIGIBLE_EFFECT:
-        words = f"negligible, {percent(worst)} of the noise"
-    elif worst < SMALL_EFFECT:
-        words = f"small, {percent(worst)} of the noise"
-    else:
-        words = f"they matter here, {percent(worst)} of the noise"
-    return Cell(words, grade(worst))
+        return Cell(f"no effect on noise ({percent(worst)})", grade(worst))
+    is_small = "small" if worst < SMALL_EFFECT else "they matter here"
+    words = "negligible" if worst < NEGLIGIBLE_EFFECT else is_small
+    return Cell(f"{words}, {percent(worst)} of the noise", grade(worst))
 
 
 def clock_table(result: Result, *, chosen: str, width: int) -> Table:

@@ -19,7 +19,7 @@ from tui.page.terminal import screen_table
 from tui.wording.formatting import utc
 
 LATEST_EVENTS = 200
-MUTED, HEADER, BAD = "#9aa5b8", "bold #4cc9f0", "bold #ff6b6b"
+HEADER, BAD = "bold #4cc9f0", "bold #ff6b6b"
 _TONES: Mapping[str, Tone] = {EventKind.MARK: "doubtful", EventKind.UNCOUNTED: "bad"}
 
 

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from daq.results.result import Result
     from tui.application.test_view.plotted import Choice
 
-MUTED = "#9aa5b8"
 _NUMBERS = ("Hz", "samples", "gaps")
 MIN_BAR = 6  # cells
 
@@ -96,15 +95,14 @@ def _noise_columns(
     now: RecordingStatus, result: Result, choice: Choice, *, with_error: bool
 ) -> dict[str, list[Cell]]:
     """Return the columns of channels, by their titles."""
-    snapshot = result.snapshot
-    band, of_sensor = result.band, _columns_of(snapshot)
+    snapshot, band = result.snapshot, result.band
     titles = ["noise, dB", f"{band[0]:.3g}–{band[1]:.3g} Hz", *choice.methods[:1]]
     columns, means = {}, noise_in_band(result, choice)
     for number in range(max(snapshot.dims)):
         title = titles[number] if number < len(titles) else " " * number
         cells = columns[title] = [Cell("") for _ in now.sensors]
         for row, sensor in enumerate(now.sensors):
-            mine = of_sensor.get(sensor.name, [])
+            mine = [n for n, each in enumerate(snapshot.channels) if each.sensor == sensor.name]
             if number < len(mine):
                 column = mine[number]
                 text, tone = _channel_noise(result, column, means, with_error=with_error)
@@ -126,13 +124,6 @@ def _gaps(sensor: SensorStatus) -> Cell:
 def grouped(count: int) -> str:
     """Return a count in groups of three digits."""
     return f"{count:,}".replace(",", "\u202f")
-
-
-def _columns_of(snapshot: Snapshot) -> dict[str, list[int]]:
-    columns: dict[str, list[int]] = {}
-    for column, label in enumerate(snapshot.channels):
-        columns.setdefault(label.sensor, []).append(column)
-    return columns
 
 
 def state(sensor: SensorStatus) -> Cell:
