@@ -115,24 +115,17 @@ def sentence(finding: CheckFinding, sensors: Sequence[str] = ()) -> str:
 
 def lines(rows: Iterable[CheckRow], *, failures_only: bool = False) -> list[Text]:
     """Return the list, a line a row; what cannot be checked of several sensors is one line."""
-    sensors: dict[tuple[Check, Problem], list[str]] = {}
-    chosen = [row for row in rows if not failures_only or row.outcome is CheckOutcome.FAILED]
-    for row in chosen:
+    groups: dict[object, list[CheckRow]] = {}
+    for number, row in enumerate(rows):
+        key: object = number
         if row.finding is not None and row.finding.problem in MERGED:
-            sensors.setdefault((row.check, row.finding.problem), []).append(row.finding.sensor)
+            key = row.check, row.finding.problem
+        if not failures_only or row.outcome is CheckOutcome.FAILED:
+            groups.setdefault(key, []).append(row)
     found = []
-    for row in chosen:
-        about, together = row.finding, None
-        if about is not None and about.problem in MERGED:
-            together = sensors.pop((row.check, about.problem), None)
-            if together is None:
-                continue
-        text = PASSED[row.check] if about is None else sentence(about, together or ())
-        found.append(
-            Text.assemble(
-                (f"{MARKS[row.outcome]} ", STYLES[row.outcome]), f"{row.check:<13} ", text
-            )
-        )
+    for group in groups.values():
+        mark = f"{MARKS[group[0].outcome]} ", STYLES[group[0].outcome]
+        found.append(Text.assemble(mark, f"{group[0].check:<13} ", _text(*group)))
     return found
 
 
@@ -142,11 +135,19 @@ def document(rows: Iterable[CheckRow]) -> list[dict[str, Any]]:
         {
             "check": row.check,
             "outcome": row.outcome,
-            "text": PASSED[row.check] if row.finding is None else sentence(row.finding),
+            "text": _text(row),
             "finding": row.finding,
         }
         for row in rows
     ]
+
+
+def _text(*rows: CheckRow) -> str:
+    """Return a row, or several that are one line, in a sentence."""
+    findings = [row.finding for row in rows if row.finding is not None]
+    if not findings:
+        return PASSED[rows[0].check]
+    return sentence(findings[0], [each.sensor for each in findings])
 
 
 def _size(n_bytes: float) -> str:

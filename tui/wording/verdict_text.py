@@ -183,11 +183,8 @@ def record_for(found: TestVerdict) -> str:
     if prediction is None or found.verdict is not Verdict.NOT_DECIDED:
         return ""
     if prediction.seconds is not None:
-        long = (
-            roughly(prediction.seconds)
-            if prediction.is_close
-            else (f"about {roughly(prediction.seconds)}")
-        )
+        about = "" if prediction.is_close else "about "
+        long = f"{about}{roughly(prediction.seconds)}"
         return f"Record for {long} in all: that decides{_slowest(found)}."
     if prediction.is_bounded:
         return (
