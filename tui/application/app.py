@@ -14,7 +14,7 @@ from daq.bench.end_condition import NEVER, EndCondition
 from daq.errors import HuddleError
 from daq.whole_file import write_whole
 from estimator.wording import clock_time
-from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen
+from tui.application.dialogs import MarkScreen, QuestionScreen, StopScreen, on_answer
 from tui.application.following import FollowingApp
 from tui.application.forms.form import Field, Form
 from tui.application.forms.issue import IssueForm
@@ -166,13 +166,9 @@ class HuddleApp(FollowingApp):
 
     def action_start(self) -> None:
         """Ask what is wanted of a test, and start a recorder."""
-
-        def start(plan: TestPlan | None) -> None:
-            if plan is not None:
-                self._begin(plan, checked=True)
-
         kept = "" if self.state.path is None else self.state.path.name
-        self.push_screen(StartForm(self._controls.bench, kept), start)
+        form = StartForm(self._controls.bench, kept)
+        self.push_screen(form, on_answer(partial(self._begin, checked=True)))
 
     def _note(self, note: str) -> None:
         self.state = replace(self.state, note=note)
@@ -226,12 +222,11 @@ class HuddleApp(FollowingApp):
             return
         path = self.state.path
 
-        def stop(really: bool | None) -> None:
-            if really:
-                self.state = replace(self.state, note="stopping …")
-                self._control(path, "stop")
+        def stop(_: bool) -> None:
+            self.state = replace(self.state, note="stopping …")
+            self._control(path, "stop")
 
-        self.push_screen(StopScreen(clock_time(self.state.now.elapsed)), stop)
+        self.push_screen(StopScreen(clock_time(self.state.now.elapsed)), on_answer(stop))
 
     def action_mark(self) -> None:
         """Ask for a remark and mark the moment."""
@@ -239,12 +234,11 @@ class HuddleApp(FollowingApp):
             return
         path, began = self.state.path, time.monotonic()
 
-        def mark(text: str | None) -> None:
-            if text is not None:
-                ago = time.monotonic() - began
-                self._control(path, "mark", text + (f" ({ago:.0f} s ago)" * (ago >= SLOW_REMARK)))
+        def mark(text: str) -> None:
+            ago = time.monotonic() - began
+            self._control(path, "mark", text + (f" ({ago:.0f} s ago)" * (ago >= SLOW_REMARK)))
 
-        self.push_screen(MarkScreen(), mark)
+        self.push_screen(MarkScreen(), on_answer(mark))
 
     @work(thread=True, group="control")
     def _control(self, path: Path, what: str, text: str = "") -> None:
@@ -293,14 +287,14 @@ class HuddleApp(FollowingApp):
         if path is None or result is None or not result.snapshot.closed:
             return
 
-        def issue(wanted: Mapping[str, str] | None) -> None:
-            if wanted is not None:
-                self._asked_of[path] = wanted
-                self.notify("verifying the recording, making the certificate …", timeout=5)
-                self._issue(path, result, wanted)
+        def issue(wanted: Mapping[str, str]) -> None:
+            self._asked_of[path] = wanted
+            self.notify("verifying the recording, making the certificate …", timeout=5)
+            self._issue(path, result, wanted)
 
         usual = {"by": self._authority} if self._authority else {}
-        self.push_screen(IssueForm(path.name, self._asked_of.get(path, usual)), issue)
+        form = IssueForm(path.name, self._asked_of.get(path, usual))
+        self.push_screen(form, on_answer(issue))
 
     @work(thread=True, group="control", description="a certificate is issued")
     def _issue(self, path: Path, result: Result, wanted: Mapping[str, str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -47,6 +47,19 @@ WORDS = (
     ("within", "error between the clocks after alignment, rms"),
     ("of noise", "share of the noise shown that this makes up; matters above 5 %"),
 )
+
+
+Answer = TypeVar("Answer")
+
+
+def on_answer(act: Callable[[Answer], object]) -> Callable[[Answer | None], None]:
+    """Return what a dialog calls at its end: acts on an answer, but not on none, or on no."""
+
+    def end(answer: Answer | None) -> None:
+        if answer is not None and answer is not False:
+            act(answer)
+
+    return end
 
 
 def help_text(keys: tuple[tuple[str, str], ...]) -> RenderableType:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from rich.console import Group, RenderableType
-from rich.style import Style
 from rich.text import Text
 from textual import work
 from textual.app import ComposeResult, SystemCommand
@@ -25,6 +24,7 @@ from tui.application.bench_view.sensors import (
     LEAST_TRACE,
     columns,
     motion_of,
+    name_cell,
     tail,
     tapped,
     trace,
@@ -481,29 +481,19 @@ def sensor_rows(
     hit = tapped(list(live.values()))
     rows = []
     for sensor in bench.sensors:
-        name, now = sensor.name, live.get(sensor.name)
-        click = {"@click": f"screen.choose({name!r})"}
-        style = Style(bold=True, reverse=name == chosen, meta=click)
         answers = f"{sensor.driver} {sensor.model}".strip()
-        row = [
-            Text(name, style),
-            Text(answers),
-            Text(sensor.serial_number),
-            Text(tail(sensor.port, min(WIDEST_PORT, width // 6))),
-            _state(now, is_hit=name == hit),
-        ]
-        if name == hit:
-            row = [cell if n == 0 else Text(cell.plain, "reverse") for n, cell in enumerate(row)]
-        rows.append(row)
+        port = tail(sensor.port, min(WIDEST_PORT, width // 6))
+        state = _state(live.get(sensor.name), is_hit=sensor.name == hit)
+        cells = [*map(Text, (answers, sensor.serial_number, port)), state]
+        if sensor.name == hit:
+            cells = [Text(cell.plain, "reverse") for cell in cells]
+        rows.append([name_cell(sensor.name, chosen), *cells])
     titles = ("sensor", "answers as", "serial no.", "port", "state")
     room = min(max(LEAST_TRACE, width - width_of(titles, rows)), 2 * WIDEST_PORT)
-    traces = [
-        Text(trace(motion_of(live[sensor.name]), width=room) if sensor.name in live else "")
-        for sensor in bench.sensors
-    ]
-    for row, each, sensor in zip(rows, traces, bench.sensors, strict=True):
-        each.stylize("bold #e9d86b" if sensor.name == hit else "#4cc9f0")
-        row.append(each)
+    for row, sensor in zip(rows, bench.sensors, strict=True):
+        now = live.get(sensor.name)
+        shown = "" if now is None else trace(motion_of(now), width=room)
+        row.append(Text(shown, "bold #e9d86b" if sensor.name == hit else "#4cc9f0"))
     return columns((*titles, "motion, 10 s"), rows)
 
 

@@ -128,7 +128,7 @@ def sensors_of_bench(state: State, *, chosen: str = "") -> Text:
         ("sensor", *(("start",) if any(failures.values()) else ()), *titles),
         [
             [
-                _name(sensor.name, chosen),
+                name_cell(sensor.name, chosen),
                 *((Text(failures[sensor.name], BAD),) if any(failures.values()) else ()),
                 *map(Text, (sensor.model, sensor.driver, sensor.port)),
                 Text(" ".join(channel.name for channel in sensor.channels)),
@@ -138,7 +138,7 @@ def sensors_of_bench(state: State, *, chosen: str = "") -> Text:
     )
 
 
-def _name(sensor: str, chosen: str) -> Text:
+def name_cell(sensor: str, chosen: str) -> Text:
     """Return the name of a sensor, which a click chooses."""
     click = {"@click": f"screen.choose({sensor!r})"}
     return Text(sensor, Style(bold=True, reverse=sensor == chosen, meta=click))
@@ -163,7 +163,7 @@ def sensor_states(
         temperature = None if about is None else about.temperature
         rows.append(
             (
-                _name(each.sensor.name, chosen),
+                name_cell(each.sensor.name, chosen),
                 Text("○ frozen", DOUBTFUL) if is_frozen else _state(each),
                 Text("" if about is None else about.model or each.sensor.model),
                 Text("" if about is None else about.serial_number),

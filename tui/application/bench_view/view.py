@@ -23,7 +23,7 @@ from tui.application.bench_view.sensors import (
     sensors_of_bench,
     spectra,
 )
-from tui.application.dialogs import QuestionScreen, TextScreen
+from tui.application.dialogs import QuestionScreen, TextScreen, on_answer
 from tui.application.forms.bench import BenchForm
 from tui.application.forms.certificate import CertificateForm
 from tui.application.forms.sensor import PortForm, SensorForm, sensor_table
@@ -232,11 +232,10 @@ class BenchView(View):
         """Ask for a new sensor."""
         self.end_preview()
 
-        def ask(found: tuple[str, dict[str, Any]] | None) -> None:
-            if found is not None:
-                self._ask(*found)
+        def ask(found: tuple[str, dict[str, Any]]) -> None:
+            self._ask(*found)
 
-        self.app.push_screen(PortForm(self._controls.find_devices), ask)
+        self.app.push_screen(PortForm(self._controls.find_devices), on_answer(ask))
 
     def action_edit(self) -> None:
         """Ask for what is to change of the chosen sensor."""
@@ -259,7 +258,8 @@ class BenchView(View):
             self.app.post_message(ErrorReported(str(error)))
             return
         known = sensor_table(text, replaces) if values is None else values
-        self.app.push_screen(SensorForm(text, driver, known, replaces=replaces), self._save)
+        form = SensorForm(text, driver, known, replaces=replaces)
+        self.app.push_screen(form, on_answer(self._save))
 
     def action_limits(self) -> None:
         """Ask for limits, and what else is common to all sensors."""
@@ -277,7 +277,7 @@ class BenchView(View):
             self.app.post_message(ErrorReported(str(error)))
             return
         self.end_preview()
-        self.app.push_screen(form, self._save)
+        self.app.push_screen(form, on_answer(self._save))
 
     def action_remove(self) -> None:
         """Remove the chosen sensor, once that has been confirmed."""
@@ -285,17 +285,16 @@ class BenchView(View):
         if self.state.bench is None or name not in {one.name for one in self.state.bench.sensors}:
             return
 
-        def remove(really: bool | None) -> None:
-            if really:
-                self._save(without_sensor(self._controls.read_bench(), name))
+        def remove(_: bool) -> None:
+            self._save(without_sensor(self._controls.read_bench(), name))
 
         question = f"Remove sensor {name} from the bench file?"
-        self.app.push_screen(QuestionScreen("remove", question, does="removes"), remove)
+        dialog = QuestionScreen("remove", question, does="removes")
+        self.app.push_screen(dialog, on_answer(remove))
 
-    def _save(self, text: str | None) -> None:
-        if text is not None:
-            self.end_preview()
-            self.app.post_message(BenchEdited(text))
+    def _save(self, text: str) -> None:
+        self.end_preview()
+        self.app.post_message(BenchEdited(text))
 
     def action_freeze(self) -> None:
         """Keep the traces as they are, or let them go on."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
@@ -13,7 +12,7 @@ from textual.widgets import DataTable, Input, Static
 
 from estimator.wording import clock_time
 from tui.application import messages
-from tui.application.dialogs import QuestionScreen
+from tui.application.dialogs import QuestionScreen, on_answer
 from tui.application.forms.estimate import SettingsForm
 from tui.application.state import RECORDINGS, RESULT, TEST, State
 from tui.application.view import BAD, MUTED, View
@@ -274,14 +273,9 @@ class RecordingsView(View):
     def action_estimate(self) -> None:
         """Ask for settings, and open the recording with them."""
         chosen = self._chosen()
-        if chosen is None:
-            return
-
-        def estimate(changes: Mapping[str, object] | None) -> None:
-            if changes is not None:
-                self._open(changes)
-
-        self.app.push_screen(SettingsForm(chosen.path.name, None), estimate)
+        if chosen is not None:
+            form = SettingsForm(chosen.path.name, None)
+            self.app.push_screen(form, on_answer(self._open))
 
     def action_compare(self) -> None:
         """Compare the chosen recording with what is shown."""
@@ -301,10 +295,6 @@ class RecordingsView(View):
         if chosen is None:
             return
         question = f"Delete {chosen.path.name} ({size(chosen.size)}), its results and its reports?"
-        self.app.push_screen(
-            QuestionScreen("delete", question, does="deletes"), partial(self._delete, chosen)
-        )
-
-    def _delete(self, chosen: Entry, really: bool | None) -> None:
-        if really:
-            self.post_message(messages.DeletionRequested(chosen.path))
+        dialog = QuestionScreen("delete", question, does="deletes")
+        deletion = messages.DeletionRequested(chosen.path)
+        self.app.push_screen(dialog, on_answer(lambda _: self.post_message(deletion)))

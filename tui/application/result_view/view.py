@@ -10,7 +10,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
-from tui.application.dialogs import TextScreen
+from tui.application.dialogs import TextScreen, on_answer
 from tui.application.forms.estimate import SettingsForm
 from tui.application.messages import OpeningRequested, ReferenceRequested
 from tui.application.result_view.result_text import result
@@ -108,14 +108,12 @@ class ResultView(View):
 
     def action_estimate(self) -> None:
         """Ask for settings, and estimate the recording again."""
-        path = self.state.path
+        path, result = self.state.path, self.state.result
         if path is None:
             return
 
-        def estimate(changes: Mapping[str, object] | None) -> None:
-            if changes is not None:
-                self.post_message(OpeningRequested(path, changes, RESULT))
+        def estimate(changes: Mapping[str, object]) -> None:
+            self.post_message(OpeningRequested(path, changes, RESULT))
 
-        result = self.state.result
         settings = None if result is None else result.settings
-        self.app.push_screen(SettingsForm(path.name, settings), estimate)
+        self.app.push_screen(SettingsForm(path.name, settings), on_answer(estimate))
