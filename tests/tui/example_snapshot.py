@@ -33,7 +33,7 @@ from daq.recording.storage.names import CONTINUES
 from daq.recording.writer import RecordingWriter
 from daq.results.decision.verdict import TestVerdict
 from daq.results.result import Result
-from estimator.checks.advice import Rank
+from estimator.checks.advice import Advice, Rank
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.diagnose import Diagnostics, diagnose
 from estimator.methods import self_noise
@@ -185,6 +185,14 @@ def diagnosed(
             untested=found.untested,
         ),
     )
+
+
+def advised(snapshot: Snapshot, *advice: Advice) -> Snapshot:
+    """Return a diagnosed snapshot with this advice and no other."""
+    found = snapshot.diagnostics
+    assert found.diagnosis is not None
+    diagnosis = replace(found.diagnosis, advice=advice)
+    return replace(snapshot, diagnostics=replace(found, diagnosis=diagnosis))
 
 
 def made_drift() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -23,6 +23,7 @@ from tests.tui.application.test_app import (
 from tests.tui.example_snapshot import (
     STRANGER,
     ProgressCallback,
+    advised,
     diagnosed,
     made_now,
     made_snapshot,
@@ -135,11 +136,7 @@ async def test_the_target_is_judged_by_the_chosen_method_whatever_curve_is_shown
 
 
 async def test_what_the_diagnosis_finds_is_shown_while_recording(told: ProgressCallback) -> None:
-    snapshot = diagnosed()
-    assert snapshot.diagnostics.diagnosis is not None
-    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
-    diagnostics = replace(snapshot.diagnostics, diagnosis=diagnosis)
-    snapshot = replace(snapshot, diagnostics=diagnostics, closed=False)
+    snapshot = replace(advised(diagnosed(), STRANGER), closed=False)
     live = tuple(replace(s, overdue_for=0.0, state=made_now().sensors[0].state)
                  for s in made_now().sensors)  # fmt: skip
     now = replace(made_now(), sensors=live)
@@ -174,11 +171,7 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
     told: ProgressCallback,
 ) -> None:
     """After 1000 s together, 100 s without C in the motion are lost in the averages."""
-    before = diagnosed(n_effective=1000.0)
-    assert before.diagnostics.diagnosis is not None
-    diagnosis = replace(before.diagnostics.diagnosis, advice=())
-    diagnostics = replace(before.diagnostics, diagnosis=diagnosis)
-    before = replace(before, closed=False, elapsed=1000.0, diagnostics=diagnostics)
+    before = replace(advised(diagnosed(n_effective=1000.0)), closed=False, elapsed=1000.0)
     alone = before.csm.copy()
     alone[:, 6:, :6] = alone[:, :6, 6:] = 0
     n_new = before.n_segments // 10

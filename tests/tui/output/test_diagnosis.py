@@ -17,7 +17,7 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Octave, Snapshot
 from daq.results.result import Result
 from estimator.spectra.segment_rejection import Reason
-from tests.tui.example_snapshot import SETTINGS, STRANGER, diagnosed, rotation, said
+from tests.tui.example_snapshot import SETTINGS, STRANGER, advised, diagnosed, rotation, said
 from tui.output.diagnosis import details
 from tui.output.results import result_table
 from tui.page.terminal import terminal_table
@@ -89,10 +89,7 @@ def test_octaves_say_what_each_has_left_out() -> None:
 
 
 def test_a_sensor_elsewhere_has_no_noise_level() -> None:
-    snapshot = diagnosed()
-    assert snapshot.diagnostics.diagnosis is not None
-    diagnosis = replace(snapshot.diagnostics.diagnosis, advice=(STRANGER,))
-    snapshot = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=diagnosis))
+    snapshot = advised(diagnosed(), STRANGER)
     table = shown([terminal_table(result_table(Result(snapshot, SETTINGS)))])
     assert table.count("no shared motion") == 3 * len(snapshot.results)
     assert table.count("no third sensor") == 6 * len(snapshot.results)

@@ -14,7 +14,7 @@ from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.decision.verdict import Obstacle, Verdict
 from tests.daq.results.decision.benches import bench_with
-from tests.tui.example_snapshot import SETTINGS, diagnosed, empty_snapshot, made_snapshot
+from tests.tui.example_snapshot import SETTINGS, advised, diagnosed, empty_snapshot, made_snapshot
 from tests.tui.wording.fact_examples import EXAMPLES, FINDINGS
 from tui.application.test_view.panels import advice, findings, known_to
 from tui.application.test_view.plotted import Choice
@@ -33,12 +33,7 @@ ALONE = ModelMisfit(
 
 def misfit(*, closed: bool = True) -> Snapshot:
     """Return a sound test whose model fails below 8.3 Hz."""
-    found = diagnosed()
-    diagnosis = found.diagnostics.diagnosis
-    assert diagnosis is not None
-    diagnosis = replace(diagnosis, advice=(ALONE,))
-    diagnostics = replace(found.diagnostics, diagnosis=diagnosis)
-    return replace(found, diagnostics=diagnostics, closed=closed)
+    return replace(advised(diagnosed(), ALONE), closed=closed)
 
 
 TESTS = {
