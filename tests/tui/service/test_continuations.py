@@ -45,9 +45,8 @@ def no_descriptors(path: Path) -> None:
 
 @pytest.mark.virtual_time
 async def test_files_that_continue_a_recording_belong_to_its_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = Place(tmp_path)
     folder = place.bench.recording_directory
     names = recorded(folder)
     request = Request([str(folder / "r.h5")], {"segment": "2s"})

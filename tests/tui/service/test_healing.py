@@ -10,6 +10,7 @@ import logging
 import math
 import sqlite3
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
@@ -72,6 +73,11 @@ def damage_page(path: Path, page: int, rng: np.random.Generator) -> None:
     path.write_bytes(content)
 
 
+def execute(path: Path, statement: str) -> list[tuple[int]]:
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        return database.execute(statement).fetchall()
+
+
 def emptied(path: Path) -> None:
     path.write_bytes(b"")
 
@@ -80,41 +86,23 @@ def overwritten(path: Path) -> None:
     path.write_bytes(b"no database" * 1000)
 
 
-def removed(path: Path) -> None:
-    path.unlink()
-
-
 def wrong_row(path: Path) -> None:
     """Damage that SQLite does not see: it has no checksums."""
-    database = sqlite3.connect(path)
-    database.execute("UPDATE runs SET state = 'dohe'")
-    database.commit()
-    database.close()
+    execute(path, "UPDATE runs SET state = 'dohe'")
 
 
 def wrong_index(path: Path) -> None:
     """Change a date in the index only: SQLite's quick check does not see it."""
     content = path.read_bytes()
-    (number,) = _page_of(path, "runs_by_due")
+    ((number,),) = execute(path, "SELECT rootpage FROM sqlite_master WHERE name = 'runs_by_due'")
     page = content[4096 * (number - 1) : 4096 * number]
     changed = page.replace(b"2026-", b"202&-")
     assert changed != page
     path.write_bytes(content[: 4096 * (number - 1)] + changed + content[4096 * number :])
 
 
-def _page_of(path: Path, index: str) -> tuple[int]:
-    with contextlib.closing(sqlite3.connect(path)) as database:
-        found: tuple[int] = database.execute(
-            "SELECT rootpage FROM sqlite_master WHERE name = ?", (index,)
-        ).fetchone()
-    return found
-
-
 def without_rows(path: Path) -> None:
-    database = sqlite3.connect(path)
-    database.execute("DELETE FROM runs")
-    database.commit()
-    database.close()
+    execute(path, "DELETE FROM runs")
 
 
 @pytest.mark.parametrize(
@@ -122,20 +110,21 @@ def without_rows(path: Path) -> None:
     [
         (emptied, False),
         (overwritten, False),
-        (removed, True),
+        (Path.unlink, True),
         (wrong_row, True),
         (wrong_index, True),
         (without_rows, True),
     ],
 )
-def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: bool) -> None:
-    place = Place(tmp_path)
+def test_all_runs_are_there_again(
+    place: Place, damage: Callable[[Path], object], *, copied: bool
+) -> None:
     run = done_run(place)
     place.store.save(run)
     if copied:
         place.store.copy(START.date())
         (place.bench.recording_directory / "r.h5").unlink()
-    damage(place.store.path)  # type: ignore[operator]  # one of the functions above
+    damage(place.store.path)
     assert heal(place.store, place.bench, START)
     assert place.store.damage() == ""
     (found,) = map(place.store.with_noise, place.store.runs())
@@ -149,9 +138,8 @@ def test_all_runs_are_there_again(tmp_path: Path, damage: object, *, copied: boo
 
 
 @pytest.mark.parametrize("copied", [True, False])
-def test_rows_that_are_lost_are_there_again(tmp_path: Path, *, copied: bool) -> None:
+def test_rows_that_are_lost_are_there_again(place: Place, *, copied: bool) -> None:
     """Also where others are left: of the copy, or of what this process has written since."""
-    place = Place(tmp_path)
     run = done_run(place)
     later = replace(run, due=run.due + timedelta(hours=1), state=RunState.DUE, parts=(), noise=())
     place.store.save(later)
@@ -161,9 +149,7 @@ def test_rows_that_are_lost_are_there_again(tmp_path: Path, *, copied: bool) -> 
     if copied:
         place.store.copy(START.date())
         (place.bench.recording_directory / "r.h5").unlink()
-    with contextlib.closing(sqlite3.connect(place.store.path)) as database:
-        database.execute("DELETE FROM runs WHERE key = ?", (run.key,))
-        database.commit()
+    execute(place.store.path, f"DELETE FROM runs WHERE key = '{run.key}'")  # noqa: S608
     store = RunStore(place.bench.recording_directory) if copied else place.store
     assert "1 run is missing" in store.damage()
     assert heal(store, place.bench, START)
@@ -172,8 +158,7 @@ def test_rows_that_are_lost_are_there_again(tmp_path: Path, *, copied: bool) -> 
     assert not heal(store, place.bench, START)
 
 
-def test_a_copy_that_is_older_than_a_result_gives_way_to_it(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+def test_a_copy_that_is_older_than_a_result_gives_way_to_it(place: Place) -> None:
     run = done_run(place)
     place.store.save(replace(run, state=RunState.RECORDING, verdict="", noise=(), ended=None))
     place.store.copy(START.date())
@@ -183,14 +168,11 @@ def test_a_copy_that_is_older_than_a_result_gives_way_to_it(tmp_path: Path) -> N
     assert list(map(place.store.with_noise, place.store.runs())) == [run]
 
 
-def test_a_damaged_text_hides_no_other(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+def test_a_damaged_text_hides_no_other(place: Place) -> None:
     run = done_run(place)
     place.store.save(run)
-    with contextlib.closing(sqlite3.connect(place.store.path)) as database:
-        database.execute("UPDATE runs SET reason = CAST(x'ff6f6b' AS TEXT)")
-        database.execute("UPDATE noise SET unit = CAST(x'ff' AS TEXT)")
-        database.commit()
+    execute(place.store.path, "UPDATE runs SET reason = CAST(x'ff6f6b' AS TEXT)")
+    execute(place.store.path, "UPDATE noise SET unit = CAST(x'ff' AS TEXT)")
     assert not heal(place.store, place.bench, START)  # SQLite has no checksums
     assert place.store.runs() == [replace(run, reason="\ufffdok", noise=())]
     noise = [each for _, _, each, _ in place.store.noise()]
@@ -198,9 +180,8 @@ def test_a_damaged_text_hides_no_other(tmp_path: Path) -> None:
 
 
 def test_a_damaged_database_is_moved_away_and_named_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
-    place = Place(tmp_path)
     place.store.save(done_run(place))
     overwritten(place.store.path)
     with caplog.at_level(logging.ERROR):
@@ -213,9 +194,8 @@ def test_a_damaged_database_is_moved_away_and_named_once(
 
 
 @pytest.mark.parametrize("page", range(6))
-def test_no_damaged_page_ends_a_service(tmp_path: Path, page: int) -> None:
+def test_no_damaged_page_ends_a_service(place: Place, page: int) -> None:
     """Every page of the database, after a day of runs; the service then has its next run."""
-    place = Place(tmp_path)
     (first,) = next_runs(place.bench, START, set())
     for hour in range(60):
         run = replace(first, due=first.due - timedelta(hours=hour + 1), reason="x" * 200)
@@ -229,8 +209,7 @@ def test_no_damaged_page_ends_a_service(tmp_path: Path, page: int) -> None:
     assert len(place.store.runs()) == 61
 
 
-def test_verify_finds_recordings_that_were_exchanged(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+def test_verify_finds_recordings_that_were_exchanged(place: Place) -> None:
     folder = place.bench.recording_directory
     for number, name in enumerate(("a.h5", "b.h5")):
         run = done_run(place, name)
@@ -245,8 +224,7 @@ def test_verify_finds_recordings_that_were_exchanged(tmp_path: Path) -> None:
     assert said.stdout.count("exchanged: not the recording that the service has made") == 2
 
 
-def test_what_is_finished_is_signed_and_known(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+def test_what_is_finished_is_signed_and_known(tmp_path: Path, place: Place) -> None:
     make_key(tmp_path / "key")
     path = place.bench.recording_directory / "r.h5"
     record(path, 12)
@@ -268,25 +246,19 @@ def test_what_is_finished_is_signed_and_known(tmp_path: Path) -> None:
 
 
 @pytest.mark.virtual_time
-async def test_a_service_records_on_and_writes_its_run_again(tmp_path: Path) -> None:
-    place = Place(tmp_path)
-    service = place.service()
-    task = asyncio.create_task(service.run())
-    await asyncio.sleep(HOUR + 100)  # within the window of 13:00
-    overwritten(place.store.path)
-    await asyncio.sleep(60)
-    states = {f"{run.due:%H:%M}": str(run.state) for run in place.store.runs()}
-    assert states == {"13:00": "recording", "14:00": "due"}
-    await asyncio.sleep(HOUR)
-    service.request_stop()
-    await asyncio.gather(task)
+async def test_a_service_records_on_and_writes_its_run_again(place: Place) -> None:
+    async with place.serving():
+        await asyncio.sleep(HOUR + 100)  # within the window of 13:00
+        overwritten(place.store.path)
+        await asyncio.sleep(60)
+        assert place.states() == [("13:00", "recording"), ("14:00", "due")]
+        await asyncio.sleep(HOUR)
     assert place.store.runs()[0].state is RunState.DONE
     assert len(place.steps.started) >= 1
 
 
 @pytest.mark.virtual_time
-async def test_a_service_starts_on_a_damaged_database(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_service_starts_on_a_damaged_database(place: Place) -> None:
     await place.serve(1.5 * HOUR)
     overwritten(place.store.path)
     await place.serve(HOUR)
@@ -304,8 +276,7 @@ async def test_the_newest_daily_copies_are_kept(
     assert [path.stem for path in place.store.copies()] == ["2026-11-23"]
 
 
-def test_an_unfinished_run_is_taken_up_and_other_recordings_are_left_alone(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+def test_an_unfinished_run_is_taken_up_and_other_recordings_are_left_alone(place: Place) -> None:
     folder = place.bench.recording_directory
     record(folder / "of_a_person.h5", 2)
     assert not heal(place.store, place.bench, START)

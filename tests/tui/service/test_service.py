@@ -25,8 +25,7 @@ pytestmark = pytest.mark.virtual_time
 HOUR = 3600.0
 
 
-async def test_runs_when_due_and_estimates_after(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_runs_when_due_and_estimates_after(place: Place) -> None:
     await place.serve(2.2 * HOUR)
     assert place.states() == [("13:00", "done"), ("14:00", "done"), ("15:00", "due")]
     run = place.store.runs()[0]
@@ -38,9 +37,8 @@ async def test_runs_when_due_and_estimates_after(tmp_path: Path) -> None:
 
 
 async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_rest(
-    tmp_path: Path,
+    place: Place,
 ) -> None:
-    place = Place(tmp_path)
     await place.serve(HOUR + 170)  # 13:03:20
     (run,) = place.store.runs("lab", *UNFINISHED)
     assert run.state is RunState.RECORDING
@@ -55,16 +53,14 @@ async def test_a_stop_in_a_window_closes_it_and_the_next_service_records_the_res
     assert [path.rpartition("/")[2] for path in request.parts] == list(run.parts)
 
 
-async def test_a_stop_in_the_last_second_of_a_window_ends_the_service(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_stop_in_the_last_second_of_a_window_ends_the_service(place: Place) -> None:
     async with asyncio.timeout(2 * HOUR):
         await place.serve(HOUR + 569)  # 13:09:59
     (run,) = place.store.runs("lab", *UNFINISHED)
     assert (run.state, run.reason) == (RunState.ESTIMATING, "")
 
 
-async def test_stops_do_not_use_up_the_attempts_of_an_estimate(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_stops_do_not_use_up_the_attempts_of_an_estimate(place: Place) -> None:
     await place.serve(HOUR + 580)  # 13:10:10
     for _ in range(MAX_ATTEMPTS + 1):
         await place.serve(10)
@@ -72,8 +68,7 @@ async def test_stops_do_not_use_up_the_attempts_of_an_estimate(tmp_path: Path) -
     assert (run.state, run.attempts) == (RunState.ESTIMATING, 0)
 
 
-async def test_a_killed_service_finds_its_recorder_again(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_killed_service_finds_its_recorder_again(place: Place) -> None:
     await place.serve(HOUR + 170, killed=True)
     (part, _), *_ = place.steps.started
     place.steps.left_running[part] = 400.0
@@ -85,10 +80,7 @@ async def test_a_killed_service_finds_its_recorder_again(tmp_path: Path) -> None
     assert run.reason == ""
 
 
-async def test_a_power_cut_beyond_the_window_leaves_the_estimate_to_be_made(
-    tmp_path: Path,
-) -> None:
-    place = Place(tmp_path)
+async def test_a_power_cut_beyond_the_window_leaves_the_estimate_to_be_made(place: Place) -> None:
     await place.serve(HOUR + 170, killed=True)
     place.clock.set_by += timedelta(hours=2.5)
     await place.serve(60)
@@ -101,8 +93,7 @@ async def test_a_power_cut_beyond_the_window_leaves_the_estimate_to_be_made(
     assert len(place.steps.started) == 1
 
 
-async def test_an_estimate_that_was_killed_is_made_again(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_an_estimate_that_was_killed_is_made_again(place: Place) -> None:
     await place.serve(HOUR + 580, killed=True)  # 13:10:10
     (run,) = place.store.runs("lab", *UNFINISHED)
     assert run.state is RunState.ESTIMATING
@@ -111,10 +102,7 @@ async def test_an_estimate_that_was_killed_is_made_again(tmp_path: Path) -> None
     assert len(place.steps.finished) == 2
 
 
-async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(
-    tmp_path: Path,
-) -> None:
-    place = Place(tmp_path)
+async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(place: Place) -> None:
     await place.serve(HOUR + 580, killed=True)  # 13:10:10
     (first,) = place.store.runs("lab", *UNFINISHED)
     place.store.save(replace(first, attempts=1))
@@ -128,8 +116,7 @@ async def test_a_run_whose_estimate_failed_waits_for_others_after_a_restart(
     assert not place.store.runs("lab", *UNFINISHED)
 
 
-async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_an_estimate_that_always_dies_is_given_up(place: Place) -> None:
     place.steps.outcomes = [FinishFailedError("the estimate was killed (signal 9)")] * 9
     await place.serve(1.5 * HOUR)
     run = place.store.runs()[0]
@@ -138,8 +125,7 @@ async def test_an_estimate_that_always_dies_is_given_up(tmp_path: Path) -> None:
     assert "killed (signal 9)" in run.reason
 
 
-async def test_a_killed_recorder_is_followed_by_another(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_killed_recorder_is_followed_by_another(place: Place) -> None:
     place.steps.endings = [(200.0, "the recorder was killed"), (None, "")]
     await place.serve(1.5 * HOUR)
     run = place.store.runs()[0]
@@ -148,8 +134,7 @@ async def test_a_killed_recorder_is_followed_by_another(tmp_path: Path) -> None:
     assert [seconds for _, seconds in place.steps.started] == [600, 395]
 
 
-async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(place: Place) -> None:
     place.steps.refuses = True
     reason = "a: no answer; b: no answer"
     place.steps.endings = [(3.0, reason)] * 20
@@ -160,8 +145,7 @@ async def test_devices_that_cannot_be_used_fail_the_run_at_its_start(tmp_path: P
     assert START_LIMIT < run.ended - run.due < 2 * START_LIMIT
 
 
-async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(place: Place) -> None:
     place.steps.endings = [(3.0, "a: no answer"), (3.0, "a: no answer"), (None, "")]
     place.steps.refuses_first = 2
     await place.serve(1.2 * HOUR)
@@ -171,8 +155,9 @@ async def test_a_cable_that_is_plugged_in_soon_costs_the_beginning_only(tmp_path
     assert [seconds for _, seconds in place.steps.started] == [600, 592, 579]
 
 
-async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(
+    tmp_path: Path, place: Place
+) -> None:
     place.steps.wrong = ["sensitivities: B.X reads 0.102 of A and C"]
     await place.serve(1.2 * HOUR)
     run = place.store.runs()[0]
@@ -191,10 +176,9 @@ async def test_a_run_waits_for_its_check_list_and_fails_with_what_is_wrong(tmp_p
 
 @pytest.mark.parametrize("takes", [12.0, 300.0], ids=["idle", "busy"])
 async def test_a_check_list_is_made_before_its_run_is_due_and_costs_it_nothing(
-    tmp_path: Path, takes: float
+    place: Place, takes: float
 ) -> None:
     """A check list that is not ready is given up; one that fails delays the run."""
-    place = Place(tmp_path)
     place.steps.check_takes = takes
     await place.serve(1.2 * HOUR)
     run = place.store.runs()[0]
@@ -213,8 +197,7 @@ async def test_runs_without_a_pause_between_them_are_recorded_without_a_check_li
     assert len(place.steps.checked) == 1
 
 
-async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_an_estimate_that_the_disk_refuses_is_made_again(place: Place) -> None:
     refused = Outcome(error="cannot be rewritten", refused=True)
     kept = Outcome(notes=("the result is not in the recording",), refused=True)
     full = OSError(errno.ENOSPC, "No space left on device")  # of the lock of the recording
@@ -226,18 +209,16 @@ async def test_an_estimate_that_the_disk_refuses_is_made_again(tmp_path: Path) -
 
 
 async def test_an_estimate_that_the_disk_refuses_for_long_has_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tui.service.service.DISK_PATIENCE", timedelta(minutes=20))
-    place = Place(tmp_path)
     place.steps.outcomes = [Outcome(error="Input/output error", refused=True)] * 50
     await place.serve(1.8 * HOUR)
     run = place.store.runs()[0]
     assert (run.state, run.reason) == (RunState.FAILED, f"{REFUSED}; Input/output error")
 
 
-async def test_an_estimate_that_is_repeated_holds_up_no_other(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_an_estimate_that_is_repeated_holds_up_no_other(place: Place) -> None:
     place.steps.outcomes = [Outcome(error="cannot be rewritten", refused=True)] * 12
     await place.serve(2.2 * HOUR)
     assert [run.state for run in place.store.runs()[:2]] == [RunState.ESTIMATING, RunState.DONE]
@@ -245,8 +226,7 @@ async def test_an_estimate_that_is_repeated_holds_up_no_other(tmp_path: Path) ->
     assert place.store.runs()[0].state is RunState.DONE
 
 
-async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_recorder_without_progress_is_killed(place: Place) -> None:
     place.steps.is_stuck = True
     await place.serve(1.5 * HOUR)
     run = place.store.runs()[0]
@@ -255,8 +235,7 @@ async def test_a_recorder_without_progress_is_killed(tmp_path: Path) -> None:
     assert run.state is RunState.DONE
 
 
-async def test_a_run_with_an_error_has_its_reason(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_run_with_an_error_has_its_reason(place: Place) -> None:
     place.steps.outcomes = [Outcome(error="no segment"), Outcome(verdict="fail", notes=("n",))]
     await place.serve(2.5 * HOUR)
     first, second, _ = place.store.runs()
@@ -345,8 +324,9 @@ async def test_a_one_shot_comes_once(tmp_path: Path) -> None:
     assert place.states() == [("13:30", "done")]
 
 
-async def test_a_reload_plans_anew_and_a_faulty_file_changes_nothing(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_reload_plans_anew_and_a_faulty_file_changes_nothing(
+    tmp_path: Path, place: Place
+) -> None:
     faults = iter([BenchFileError(FileFault("schedule", "wrong"), source="lab.toml")])
 
     def reload() -> Bench:
@@ -365,8 +345,7 @@ async def test_a_reload_plans_anew_and_a_faulty_file_changes_nothing(tmp_path: P
         assert place.states() == [("12:30", "due")]
 
 
-async def test_a_clock_set_back_repeats_no_run(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_clock_set_back_repeats_no_run(place: Place) -> None:
     async with place.serving():
         await asyncio.sleep(1.5 * HOUR)
         place.clock.set_by -= timedelta(hours=1)
@@ -374,8 +353,7 @@ async def test_a_clock_set_back_repeats_no_run(tmp_path: Path) -> None:
     assert place.states() == [("13:00", "done"), ("14:00", "due")]
 
 
-async def test_a_clock_set_forward_by_years_has_missed_nothing(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_clock_set_forward_by_years_has_missed_nothing(place: Place) -> None:
     async with place.serving():
         await asyncio.sleep(60)
         place.clock.set_by += timedelta(days=4000)
@@ -383,8 +361,7 @@ async def test_a_clock_set_forward_by_years_has_missed_nothing(tmp_path: Path) -
     assert [state for _, state in place.states()] == ["done", "due"]
 
 
-async def test_a_clock_ahead_at_the_start_and_then_set_right(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_clock_ahead_at_the_start_and_then_set_right(place: Place) -> None:
     place.clock.set_by += timedelta(days=3)
     async with place.serving():
         await asyncio.sleep(60)
@@ -395,8 +372,7 @@ async def test_a_clock_ahead_at_the_start_and_then_set_right(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("days", [-3, 3])
-async def test_a_step_within_a_window_does_not_change_its_length(tmp_path: Path, days: int) -> None:
-    place = Place(tmp_path)
+async def test_a_step_within_a_window_does_not_change_its_length(place: Place, days: int) -> None:
     async with place.serving():
         await asyncio.sleep(HOUR + 100)  # in the window of 13:00, which takes ten minutes
         place.clock.set_by += timedelta(days=days)
@@ -409,9 +385,8 @@ async def test_a_step_within_a_window_does_not_change_its_length(tmp_path: Path,
 
 
 async def test_a_run_planned_by_an_earlier_service_is_missed_once_the_clock_is_right(
-    tmp_path: Path,
+    place: Place,
 ) -> None:
-    place = Place(tmp_path)
     await place.serve(60)  # plans 13:00
     place.clock.set_by -= timedelta(days=3)  # off for a while; behind at the next start
     async with place.serving():
@@ -422,9 +397,8 @@ async def test_a_run_planned_by_an_earlier_service_is_missed_once_the_clock_is_r
     assert place.states() == [("13:00", "missed"), ("14:00", "missed"), ("15:00", "due")]
 
 
-async def test_the_first_run_waits_for_a_synchronised_clock(tmp_path: Path) -> None:
+async def test_the_first_run_waits_for_a_synchronised_clock(place: Place) -> None:
     """The clock is three days behind at the start, and set after seven minutes."""
-    place = Place(tmp_path)
     await place.serve(60)  # plans 13:00
     await asyncio.sleep(58 * 60)  # 12:59:30
     place.clock.synchronised = False
@@ -446,9 +420,8 @@ async def test_the_first_run_waits_for_a_synchronised_clock(tmp_path: Path) -> N
 
 
 async def test_without_synchronisation_runs_begin_after_ten_minutes_and_say_so(
-    tmp_path: Path,
+    place: Place,
 ) -> None:
-    place = Place(tmp_path)
     await place.serve(60)
     await asyncio.sleep(5.5 * HOUR)  # 17:31:30
     place.clock.synchronised = False
@@ -464,8 +437,7 @@ async def test_without_synchronisation_runs_begin_after_ten_minutes_and_say_so(
     assert place.states() == [*missed, ("18:00", "done"), ("19:00", "due")]
 
 
-async def test_a_run_that_is_due_while_the_clock_is_waited_for_begins_late(tmp_path: Path) -> None:
-    place = Place(tmp_path)
+async def test_a_run_that_is_due_while_the_clock_is_waited_for_begins_late(place: Place) -> None:
     await asyncio.sleep(59 * 60)  # 12:59:30
     place.clock.synchronised = False
     async with place.serving():
@@ -476,9 +448,8 @@ async def test_a_run_that_is_due_while_the_clock_is_waited_for_begins_late(tmp_p
 
 
 async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = Place(tmp_path)
     free = 10**9
     for module in ("window", "service"):
         monkeypatch.setattr(f"tui.service.{module}.free_space", lambda _: free)
@@ -503,9 +474,8 @@ async def test_no_run_starts_on_a_full_disk_and_a_running_one_is_closed(
 
 
 async def test_a_database_that_cannot_be_written_is_written_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = Place(tmp_path)
     save = RunStore.save
     is_broken = False
 
