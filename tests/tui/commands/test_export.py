@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import h5py
@@ -29,8 +30,8 @@ import huddle
 from daq.estimation.snapshot import Snapshot
 from daq.formats.importer import import_files
 from daq.formats.miniseed_export import export_miniseed
-from daq.formats.readers.waveforms import load_obspy
 from daq.recording.reader import Recording
+from estimator.self_noise.result import SelfNoise
 from tests import command
 from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, create
 from tests.daq.formats.test_sources import START, STEP, counts, write_records
@@ -51,6 +52,19 @@ channels = [{{name = "X", sensitivity = 400.0}}, {{name = "Y", sensitivity = 500
 """
     for name in ("front left", "rear", "B3")
 )
+
+
+@pytest.fixture
+def obspy() -> ModuleType:
+    module: ModuleType = pytest.importorskip("obspy", reason="ObsPy is an extra")
+    return module
+
+
+def export_to(folder: Path) -> Path:
+    """Write the recording of a folder as miniSEED and StationXML."""
+    with Recording.open(folder / "a.h5") as opened:
+        export_miniseed(opened, folder / "a.mseed", folder / "a.xml")
+    return folder / "a.mseed"
 
 
 def run(*arguments: object) -> Result:
@@ -91,6 +105,12 @@ def made(recording: Path) -> huddle.Result:
 @pytest.fixture(scope="module")
 def snapshot(made: huddle.Result) -> Snapshot:
     return made.snapshot
+
+
+@pytest.fixture(scope="module")
+def noise(snapshot: Snapshot) -> SelfNoise:
+    (found,) = snapshot.results.values()
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +162,7 @@ def copy(exported: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Pat
     return copied
 
 
-@pytest.mark.usefixtures("needs_obspy")
-def test_miniseed_and_back_in_obspy(tmp_path: Path) -> None:
-    obspy = load_obspy()
+def test_miniseed_and_back_in_obspy(obspy: ModuleType, tmp_path: Path) -> None:
     x = counts(5000, 1)
     for first, end in ((0, 2000), (2017, 5000)):
         start = START + 123_000 + first * STEP
@@ -170,9 +188,9 @@ def test_miniseed_and_back_in_obspy(tmp_path: Path) -> None:
     assert sorted(inventory.get_contents()["channels"]) == sorted({trace.id for trace in ours})
 
 
-@pytest.mark.usefixtures("needs_obspy")
-def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_path: Path) -> None:
-    obspy = load_obspy()
+def test_miniseed_of_any_recording_has_codes_and_responses(
+    obspy: ModuleType, recording: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "b.mseed"
     found = run(recording, "--format", "mseed", "-o", out, "--json", "-")
     document = json.loads(found.stdout)
@@ -200,23 +218,21 @@ def test_miniseed_of_any_recording_has_codes_and_responses(recording: Path, tmp_
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i8"])
-@pytest.mark.usefixtures("needs_obspy")
-def test_miniseed_of_any_type_of_sample_is_read_as_it_was(tmp_path: Path, dtype: str) -> None:
+def test_miniseed_of_any_type_of_sample_is_read_as_it_was(
+    obspy: ModuleType, tmp_path: Path, dtype: str
+) -> None:
     """HDF5 states the order of bytes of floats, which ObsPy took for the other one."""
-    obspy = load_obspy()
     samples = (1e10 * np.random.default_rng(4).normal(size=(6000, 2))).astype(dtype)
     np.savez(tmp_path / "a.npz", sampling_rate=100.0, A=samples)
     import_files([tmp_path / "a.npz"], tmp_path / "a.h5")
-    with Recording.open(tmp_path / "a.h5") as opened:
-        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
-    stream = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1).sort()
+    stream = obspy.read(str(export_to(tmp_path)), format="MSEED").merge(method=-1).sort()
     np.testing.assert_array_equal(np.column_stack([trace.data for trace in stream]), samples)
 
 
 @pytest.mark.parametrize("states_utc", [True, pytest.param(False, marks=pytest.mark.long)])
-@pytest.mark.usefixtures("needs_obspy")
-def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_utc: bool) -> None:
-    obspy = load_obspy()
+def test_miniseed_of_a_clock_off_its_rate_is_on_time(
+    obspy: ModuleType, tmp_path: Path, *, states_utc: bool
+) -> None:
     rate, n = 100 * (1 + 80e-6), 8 * 4100
     sensor = Sensor(
         np.arange(n, dtype=np.int32)[:, None] % 9973, rate=rate, nominal=100.0, utc=states_utc
@@ -225,9 +241,7 @@ def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_u
     for block in blocks("a", sensor, block=41.0):
         writer.append(block)
     writer.close()
-    with Recording.open(tmp_path / "a.h5") as opened:
-        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
-    content = (tmp_path / "a.mseed").read_bytes()
+    content = export_to(tmp_path).read_bytes()
     late, first = [], 0
     for at in range(0, len(content), 512):  # a reader joins records; each states its time
         (record,) = obspy.read(io.BytesIO(content[at : at + 512]), format="MSEED")
@@ -243,9 +257,9 @@ def test_miniseed_of_a_clock_off_its_rate_is_on_time(tmp_path: Path, *, states_u
     assert np.ptp(error) <= 0.005 / 100 + 2e-6  # times of miniSEED are whole microseconds
 
 
-@pytest.mark.usefixtures("needs_obspy")
-def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recording: Path) -> None:
-    obspy = load_obspy()
+def test_public_recording_through_import_and_export(
+    obspy: ModuleType, tmp_path: Path, usgs_recording: Path
+) -> None:
     sources = sorted(usgs_recording.glob("TST5_*_BH0.mseed"))
     resp = usgs_recording / "T-compact_Q330HR_BH_40"
     import_files(sources, tmp_path / "a.h5", response_for=[("*", resp)])
@@ -280,14 +294,12 @@ def test_public_recording_through_import_and_export(tmp_path: Path, usgs_recordi
         "WUQ.XJ.HHN.D.2008.285.first_record",
     ],
 )
-@pytest.mark.usefixtures("needs_obspy")
-def test_files_of_networks_through_import_and_export(tmp_path: Path, name: str) -> None:
-    obspy = load_obspy()
-    source = Path(obspy.__file__).parent / "io/mseed/tests/data" / name
+def test_files_of_networks_through_import_and_export(
+    obspy: ModuleType, tmp_path: Path, name: str
+) -> None:
+    source = Path(str(obspy.__file__)).parent / "io/mseed/tests/data" / name
     import_files([source], tmp_path / "a.h5")
-    with Recording.open(tmp_path / "a.h5") as opened:
-        export_miniseed(opened, tmp_path / "a.mseed", tmp_path / "a.xml")
-    ours = obspy.read(str(tmp_path / "a.mseed"), format="MSEED").merge(method=-1).sort()
+    ours = obspy.read(str(export_to(tmp_path)), format="MSEED").merge(method=-1).sort()
     theirs = obspy.read(str(source), format="MSEED").merge(method=-1).sort()
     assert [trace.id for trace in ours] == [trace.id for trace in theirs]
     for our, their in zip(ours, theirs, strict=True):
@@ -295,37 +307,34 @@ def test_files_of_networks_through_import_and_export(tmp_path: Path, name: str) 
         np.testing.assert_array_equal(our.data, their.data)
 
 
-def test_tidy_csv(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+def test_tidy_csv(exported: Callable[[str], Path], snapshot: Snapshot, noise: SelfNoise) -> None:
     with exported("csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["sensor"] == "rear"]
-    (method,) = snapshot.results
-    assert {row["method"] for row in rows} == {method}
+    assert {row["method"] for row in rows} == {"three-sensor"}
     assert {row["unit"] for row in rows} == {"m/s²"}
     found = [float(row["noise_psd"]) for row in rows if row["channel"] == "Y" and row["noise_psd"]]
     column = [(label.sensor, label.channel) for label in snapshot.channels].index(("rear", "Y"))
     flags = [int(row["flags"]) for row in rows if row["channel"] == "Y"]
-    assert flags == snapshot.results[method].flags[:, column].tolist()
-    expected = snapshot.results[method].noise_psd[:, column]
+    assert flags == noise.flags[:, column].tolist()
+    expected = noise.noise_psd[:, column]
     np.testing.assert_array_equal(found, expected[np.isfinite(expected)])
 
 
-def test_netcdf(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+def test_netcdf(exported: Callable[[str], Path], noise: SelfNoise) -> None:
     with xr.open_dataset(exported("netcdf"), engine="h5netcdf") as found:
-        (method,) = snapshot.results
-        rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
-        np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
+        rear = found["noise_psd"].sel(estimate="three-sensor", trace="rear.X")
+        np.testing.assert_array_equal(rear, noise.noise_psd[:, 2])
         assert found["noise_psd"].attrs["units"] == "(m s-2)2 Hz-1"
 
 
 @pytest.mark.usefixtures("zarr_threads")
 def test_zarr(
-    exported: Callable[[str], Path], made: huddle.Result, snapshot: Snapshot, tmp_path: Path
+    exported: Callable[[str], Path], made: huddle.Result, noise: SelfNoise, tmp_path: Path
 ) -> None:
     found = huddle.load(exported("zarr"))
-    (method,) = snapshot.results
-    rear = found["noise_psd"].sel(estimate=method, trace="rear.X")
-    np.testing.assert_array_equal(rear, snapshot.results[method].noise_psd[:, 2])
-    np.testing.assert_array_equal(found["flags"][0].T, snapshot.results[method].flags)
+    rear = found["noise_psd"].sel(estimate="three-sensor", trace="rear.X")
+    np.testing.assert_array_equal(rear, noise.noise_psd[:, 2])
+    np.testing.assert_array_equal(found["flags"][0].T, noise.flags)
     assert found["noise_psd"].attrs["units"] == "(m s-2)2 Hz-1"
     own = tmp_path / "mine.zarr"
     (own / "thesis").mkdir(parents=True)
@@ -402,43 +411,39 @@ def test_load_says_what_reads_other_files(recording: Path, tmp_path: Path) -> No
         huddle.load(tmp_path / "a.nc")
 
 
-def test_mat_and_numpy(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
-    (method,) = snapshot.results
+def test_mat_and_numpy(
+    exported: Callable[[str], Path], snapshot: Snapshot, noise: SelfNoise
+) -> None:
     matlab = loadmat(exported("mat"))
     with np.load(exported("npz"), allow_pickle=False) as numpy:
         assert numpy["sensors"].tolist() == [label.sensor for label in snapshot.channels]
         for name, expected in (
             ("data_psd", snapshot.data_psd),
-            (f"{method.replace('-', '_')}_noise_low", snapshot.results[method].low),
-            (f"{method.replace('-', '_')}_flags", snapshot.results[method].flags),
+            ("three_sensor_noise_low", noise.low),
+            ("three_sensor_flags", noise.flags),
         ):
             np.testing.assert_array_equal(numpy[name], expected)
             np.testing.assert_array_equal(matlab[name], expected)
     assert [cell[0].item() for cell in matlab["units"]] == ["(m/s²)²/Hz"] * 6
 
 
-def test_universal_file(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+def test_universal_file(
+    exported: Callable[[str], Path], snapshot: Snapshot, noise: SelfNoise
+) -> None:
     sets = pyuff.UFF(str(exported("uff58"))).read_sets()
     assert {each["func_type"] for each in sets} == {9}
-    (method,) = snapshot.results
-    (found,) = [each for each in sets if each["id1"].strip() == f"rear.Y {method} noise_psd"]
+    (found,) = [each for each in sets if each["id1"].strip() == "rear.Y three-sensor noise_psd"]
     assert (found["rsp_node"], found["rsp_dir"], found["rsp_ent_name"].strip()) == (2, 2, "rear")
-    np.testing.assert_array_equal(found["data"], snapshot.results[method].noise_psd[2:, 3])
+    np.testing.assert_array_equal(found["data"], noise.noise_psd[2:, 3])
     np.testing.assert_allclose(found["x"], snapshot.frequency[2:], rtol=1e-5)
 
 
-def test_parquet(exported: Callable[[str], Path], snapshot: Snapshot) -> None:
+def test_parquet(exported: Callable[[str], Path], noise: SelfNoise) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is large, and an extra")
     table = parquet.read_table(exported("parquet")).to_pydict()
-    (method,) = snapshot.results
-    found = [
-        value
-        for value, sensor, channel in zip(
-            table["noise_psd"], table["sensor"], table["channel"], strict=True
-        )
-        if (sensor, channel) == ("B3", "X")
-    ]
-    np.testing.assert_array_equal(found, snapshot.results[method].noise_psd[:, 4])
+    rows = zip(table["noise_psd"], table["sensor"], table["channel"], strict=True)
+    found = [psd for psd, *channel in rows if channel == ["B3", "X"]]
+    np.testing.assert_array_equal(found, noise.noise_psd[:, 4])
     assert set(table["unit"]) == {"m/s²"}
 
 
