@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
-from xml.etree import ElementTree as ET
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from estimator.levels.interval import NORMAL_95
 from tests.tui.example_snapshot import SETTINGS, demo_bench, made_snapshot
 from tui.application.test_view.curves import noise_curve
 from tui.application.test_view.units import units_of
-from tui.certificate.dcc import SI, _mean
+from tui.certificate.dcc import _mean
 from tui.notebook import result as notebooks
 from tui.output.json_document import _band_means
 from tui.output.results import result_table
@@ -92,13 +92,9 @@ def test_table_report_certificate_json_page_curve_verdict_and_budget_have_the_sa
 
     budgets = band_budgets(Result(snapshot, THIRD))
     for column, total in enumerate(budgets):
-        certified = ET.Element("data")
-        _mean(certified, total, "mean", 1.0, "one")
-        ends = [
-            float(each.text or "")
-            for end in ("Min", "Max")
-            for each in certified.iter(f"{{{SI}}}interval{end}")
-        ]
+        certified: Any = _mean(total, "mean", 1.0, "one")
+        interval = certified["si:real"]["si:coverageInterval"]
+        ends = [float(interval[f"si:interval{end}"]) for end in ("Min", "Max")]
         np.testing.assert_allclose(ends, [low[column], high[column]], rtol=1e-7)
 
     console = Console(width=200, no_color=True)
