@@ -23,6 +23,11 @@ def printed(*arguments: object, code: int = 0) -> str:
     return huddle(*arguments, code=code, terminal_width=200).stdout
 
 
+def words_of(*arguments: object, code: int = 0) -> str:
+    """Return all words that the command writes, to either output, in one line."""
+    return " ".join(huddle(*arguments, code=code).output.split())
+
+
 def modules_after(code: str) -> set[str]:
     """Return the names of the modules that are loaded after code ran in a new interpreter."""
     run = [sys.executable, "-c", f"import sys; {code}\nprint(*sys.modules)"]

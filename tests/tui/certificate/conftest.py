@@ -55,6 +55,4 @@ def issued(tmp_path_factory: pytest.TempPathFactory, drawn_up: list[Report]) -> 
 
 @pytest.fixture
 def copied(issued: Laboratory, tmp_path: Path) -> Laboratory:
-    folder = tmp_path / "laboratory"
-    shutil.copytree(issued.folder, folder)
-    return Laboratory(folder, folder / "night.h5", folder / "bench.toml")
+    return Laboratory(shutil.copytree(issued.folder, tmp_path / "laboratory"))

@@ -6,17 +6,18 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import h5py
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import pkcs12
 from cryptography.x509.oid import NameOID
 from pypdf import PdfReader
-from typer.testing import CliRunner
 
-from tests.command import huddle
+from daq.recording.chunks.manifest import write_manifest
+from daq.recording.description import write_checksums
+from tests.command import huddle, words_of
 from tests.tui.night_recording import BENCH, HOSTILE, SENSOR, record
-from tui.commands.main import app
 
 ABOUT = """
 [laboratory]
@@ -50,20 +51,31 @@ class Laboratory:
     """A folder with a recording, and the bench file that describes the parties."""
 
     folder: Path
-    recording: Path
-    bench: Path
 
     def issue(self, *more: str, by: str = "Grace Hopper") -> str:
         """Issue a certificate; a channel is dead: not decided, and invalid without a reason."""
         arguments = ["issue", str(self.recording), "--by", by, "--bench", str(self.bench)]
         arguments += ["--despite", DESPITE, *more]
-        found = huddle(*arguments, code=4)
-        return found.output
+        return huddle(*arguments, code=4).output
 
-    def verify(self, *files: Path | str) -> tuple[int, str]:
-        """Verify files; return exit code and all that was said."""
-        found = CliRunner().invoke(app, ["verify", *map(str, files)])
-        return found.exit_code, " ".join((found.output + found.stderr).split())
+    @property
+    def recording(self) -> Path:
+        """Of one night."""
+        return self.folder / "night.h5"
+
+    @property
+    def bench(self) -> Path:
+        """Its bench file."""
+        return self.folder / "bench.toml"
+
+    def refused(self, *more: str) -> str:
+        """Ask for a certificate that is not issued; return what is said."""
+        ordered = ["issue", self.recording, "--by", "Ada", "--bench", self.bench]
+        return words_of(*ordered, *more, code=2)
+
+    def verify(self, *files: Path | str, code: int = 0) -> str:
+        """Verify files; return all that is said."""
+        return words_of("verify", *files, code=code)
 
     @property
     def certificates(self) -> Path:
@@ -78,7 +90,8 @@ class Laboratory:
 
 def laboratory(folder: Path) -> Laboratory:
     folder.mkdir(exist_ok=True)
-    recording = record(folder / "night.h5")
+    made = Laboratory(folder)
+    record(made.recording)
     sensors = "".join(
         SENSOR.format(name=name, number=number).replace(
             "serial_number", 'manufacturer = "Acme Sensors"\nserial_number'
@@ -87,9 +100,16 @@ def laboratory(folder: Path) -> Laboratory:
         for number, name in enumerate(("A", "B", "C", HOSTILE))
     )
     sensors = sensors.replace("sensitivity = 1e6", f"sensitivity = 1e6, {CALIBRATED}")
-    bench = folder / "bench.toml"
-    bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
-    return Laboratory(folder, recording, bench)
+    made.bench.write_text(BENCH.format(sensors=sensors, psd=2e-9) + ABOUT, encoding="utf-8")
+    return made
+
+
+def rescale(recording: Path) -> None:
+    """Change a sensitivity, and the checksums with it."""
+    with h5py.File(recording, "r+") as file:
+        file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
+        write_checksums(file)
+        write_manifest(file)
 
 
 def text_of(path: Path) -> str:

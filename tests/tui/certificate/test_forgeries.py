@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from cryptography import x509
@@ -24,11 +23,8 @@ from cryptography.hazmat.primitives.serialization import pkcs12
 from pypdf import PdfReader, PdfWriter
 from pypdf.generic import ContentStream, NameObject
 
-from daq.recording.chunks.manifest import write_manifest
-from daq.recording.description import write_checksums
-from tests.command import huddle
 from tests.traced_memory import peak_of
-from tests.tui.certificate.laboratory import Laboratory, key, laboratory
+from tests.tui.certificate.laboratory import Laboratory, key, laboratory, rescale
 from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import PdfSignature, Signer, signatures
@@ -92,9 +88,9 @@ class Signed:
     other: Path
     """Private key of somebody who uses the same name."""
 
-    def check(self, *files: Path, trusted: bool = True) -> tuple[int, str]:
+    def check(self, *files: Path, trusted: bool = True, code: int = 0) -> str:
         """Verify; `trusted`: with the public key of the laboratory."""
-        return self.lab.verify(*files, *(("--key", self.public) if trusted else ()))
+        return self.lab.verify(*files, *(("--key", self.public) if trusted else ()), code=code)
 
     @property
     def certificate(self) -> Path:
@@ -119,9 +115,7 @@ def signing(tmp_path_factory: pytest.TempPathFactory) -> Signed:
 @pytest.fixture
 def forged(signing: Signed, tmp_path: Path) -> Signed:
     """Return a copy that a test may forge."""
-    folder = tmp_path / "lab"
-    shutil.copytree(signing.lab.folder, folder)
-    lab = Laboratory(folder, folder / "night.h5", folder / "bench.toml")
+    lab = Laboratory(shutil.copytree(signing.lab.folder, tmp_path / "lab"))
     return Signed(lab, signing.public, signing.other)
 
 
@@ -255,10 +249,7 @@ def rolled_back(made: Signed) -> None:
 
 
 def checksums_rewritten(made: Signed) -> None:
-    with h5py.File(made.lab.recording, "r+") as file:
-        file["sensors/A/samples"].attrs["sensitivity"] = [1.5e6, 1.5e6]
-        write_checksums(file)
-        write_manifest(file)
+    rescale(made.lab.recording)
 
 
 def flipped_bit(made: Signed) -> None:
@@ -307,8 +298,7 @@ FORGERIES: dict[Callable[[Signed], None], str] = {
 
 def test_the_genuine_one_is(signing: Signed) -> None:
     for trusted in (False, True):
-        code, said = signing.check(signing.certificate, signing.lab.recording, trusted=trusted)
-        assert code == 0, said
+        said = signing.check(signing.certificate, signing.lab.recording, trusted=trusted)
         assert "the one certified, unchanged" in said
     content = signing.certificate.read_bytes()
     (found,) = signatures(content)
@@ -322,10 +312,8 @@ def test_who_does_not_know_the_passphrase_issues_nothing(
     forged: Signed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HUDDLE_PASSPHRASE", "wrong")
-    arguments = ["issue", str(forged.lab.recording), "--by", "Ada", "--reason", "signed"]
-    arguments += ["--bench", str(forged.lab.bench), "--sign", str(forged.other)]
-    refused = huddle(*arguments, code=2)
-    assert "passphrase is wrong" in refused.stderr
+    refused = forged.lab.refused("--reason", "signed", "--sign", str(forged.other))
+    assert "passphrase is wrong" in refused
     assert len(Ledger(forged.lab.certificates).entries()) == 2  # it took no number
 
 
@@ -342,8 +330,7 @@ def test_a_forgery_is_named(
 ) -> None:
     """With the key of the laboratory, and without, which is harder."""
     forge(forged)
-    code, said = forged.check(forged.certificate, forged.lab.recording, trusted=trusted)
-    assert code == 3, said
+    said = forged.check(forged.certificate, forged.lab.recording, trusted=trusted, code=3)
     assert words in said
     assert "signed by" not in said
 
@@ -358,11 +345,9 @@ def test_a_forgery_is_named(
 def test_recordings_are_not_certified_by_a_ledger_without_its_signature(
     forged: Signed, forge: Callable[[Signed], None], words: str
 ) -> None:
-    assert forged.lab.verify(forged.lab.recording)[0] == 0
+    forged.lab.verify(forged.lab.recording)
     forge(forged)
-    code, said = forged.lab.verify(forged.lab.recording)
-    assert code == 3, said
-    assert words in said
+    assert words in forged.lab.verify(forged.lab.recording, code=3)
 
 
 @pytest.mark.parametrize("forge", [truncated, rolled_back])
@@ -373,23 +358,17 @@ def test_a_ledger_without_its_last_rows_hides_no_certificate_of_its_folder(
     first, lacking = forged.lab.certificate(0), forged.certificate.stem
     forge(forged)
     for each in (first, forged.lab.recording):
-        code, said = forged.lab.verify(each)
-        assert code == 3
-        assert f"the ledger lacks {lacking} of the folder" in said
-    again = ["--bench", str(forged.lab.bench), "--despite", "x", "--reason", "y", "--by", "Ada"]
-    refused = huddle("issue", forged.lab.recording, *again, code=2)
-    assert "the ledger" in refused.stderr
+        assert f"the ledger lacks {lacking} of the folder" in forged.lab.verify(each, code=3)
+    assert "the ledger" in forged.lab.refused("--despite", "x", "--reason", "y")
 
 
 def test_what_an_older_copy_of_a_ledger_proves_is_what_it_proved_then(forged: Signed) -> None:
     """Without any later certificate, only a truncated ledger lacks its signature."""
     forged.certificate.unlink()
     rolled_back(forged)
-    assert forged.check(forged.lab.certificate(0), forged.lab.recording)[0] == 0
+    forged.check(forged.lab.certificate(0), forged.lab.recording)
     truncated(forged)
-    code, said = forged.check(forged.lab.certificate(0))
-    assert code == 3
-    assert "the ledger is not signed with key" in said
+    assert "the ledger is not signed with key" in forged.check(forged.lab.certificate(0), code=3)
 
 
 def test_another_laboratory_of_the_same_name_does_not_have_the_key(
@@ -400,31 +379,23 @@ def test_another_laboratory_of_the_same_name_does_not_have_the_key(
     shutil.rmtree(forged.lab.certificates)
     forged.lab.issue("--sign", str(forged.other))
     path = forged.lab.certificate(0)
-    code, said = forged.check(path, trusted=False)
-    assert code == 0
-    assert "whose key this is, --key or a reader shows" in said
-    code, said = forged.check(path)
-    assert code == 3
+    assert "whose key this is, --key or a reader shows" in forged.check(path, trusted=False)
+    said = forged.check(path, code=3)
     assert "not genuine" in said
     assert "expected" in said
     missing = tmp_path / "nonexistent"
-    code, said = forged.lab.verify(path, "--key", missing)
-    assert code == 2
+    said = forged.lab.verify(path, "--key", missing, code=2)
     assert str(missing) in "".join(said.split())
-    code, said = forged.lab.verify(path, "--key", forged.lab.bench)
-    assert code == 2
-    assert "no public key" in said
+    assert "no public key" in forged.lab.verify(path, "--key", forged.lab.bench, code=2)
 
 
 def test_an_unsigned_certificate_is_not_what_a_key_asks_for(
     issued: Laboratory, signing: Signed
 ) -> None:
-    code, said = issued.verify(issued.certificate())
-    assert code == 0
+    said = issued.verify(issued.certificate())
     assert "not signed: who can write the folder can write certificate and ledger anew" in said
     assert f"recording {issued.recording}: the one certified, unchanged" in said  # it is beside
-    code, said = issued.verify(issued.certificate(), "--key", signing.public)
-    assert code == 3
+    said = issued.verify(issued.certificate(), "--key", signing.public, code=3)
     assert "it is not signed" in said
 
 
@@ -450,44 +421,32 @@ def test_a_ledger_of_an_earlier_version_is_read_and_says_what_it_cannot_prove(
     with closing(sqlite3.connect(made.certificates / NAME)) as rows:
         rows.executescript("DROP TABLE heads;")
     path = made.certificate()
-    code, said = made.verify(path, made.recording)
-    assert code == 0, said
+    said = made.verify(path, made.recording)
     assert "issued by an earlier version: it does not say of which contents it is" in said
     assert "of an earlier version, does not say whether it was signed" in said
     private = key(tmp_path / "lab.p12", SECRET.encode())
     monkeypatch.setenv("HUDDLE_PASSPHRASE", SECRET)
     made.issue("--reason", "now signed", "--sign", str(private))
     public = exported(private)
-    assert made.verify(made.certificate(1), "--key", public)[0] == 0
-    code, said = made.verify(path, "--key", public)
-    assert code == 3
-    assert "it is not signed" in said
+    made.verify(made.certificate(1), "--key", public)
+    assert "it is not signed" in made.verify(path, "--key", public, code=3)
 
 
 def test_who_has_the_key_and_no_ledger_verifies_the_signature(
     signing: Signed, tmp_path: Path
 ) -> None:
     path = Path(shutil.copy(signing.certificate, tmp_path / "received.pdf"))
-    code, said = signing.check(path, trusted=False)
-    assert code == 3
-    assert "there is no ledger" in said
-    code, said = signing.check(path, signing.lab.recording)
-    assert code == 0, said
+    assert "there is no ledger" in signing.check(path, trusted=False, code=3)
+    said = signing.check(path, signing.lab.recording)
     assert "no ledger here: a later revision would not be known" in said
     assert "the one certified" in said
     folder = signing.lab.certificates
-    code, said = signing.lab.verify(path, "--certificates", folder)
-    assert code == 0
-    assert "ledger signed with key" in said
+    assert "ledger signed with key" in signing.lab.verify(path, "--certificates", folder)
     recording = Path(shutil.copy(signing.lab.recording, tmp_path / "night.h5"))
-    checksums_rewritten(Signed(Laboratory(tmp_path, recording, path), path, path))
-    code, said = signing.check(path, recording)
-    assert code == 3
-    assert "was changed since the certificate" in said
+    rescale(recording)
+    assert "was changed since the certificate" in signing.check(path, recording, code=3)
     stripped(path)
-    code, said = signing.check(path)
-    assert code == 3
-    assert "was removed" in said
+    assert "was removed" in signing.check(path, code=3)
 
 
 def test_a_damaged_certificate_is_refused_whatever_the_damage(signing: Signed) -> None:

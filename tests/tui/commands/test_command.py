@@ -26,7 +26,7 @@ from daq.preflight.device_check import SensorCheck
 from daq.python_process import python_command
 from docs import reference
 from sim_devices.world.paper_scenarios import SCENARIOS
-from tests.command import huddle, modules_after, printed
+from tests.command import huddle, modules_after, printed, words_of
 from tui.commands.check import remarks
 from tui.commands.help import COMMANDS, PANELS, subcommand
 from tui.commands.main import app, main
@@ -338,8 +338,7 @@ def test_usage_is_exit_2(tmp_path: Path) -> None:
 
 def test_files_in_trouble_are_exit_3(tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_text("not HDF5")
-    result = huddle("estimate", str(tmp_path / "a.h5"), code=3)
-    assert "a.h5: not a huddle recording" in result.stderr
+    assert "a.h5: not a huddle recording" in words_of("estimate", str(tmp_path / "a.h5"), code=3)
     for name, command in (("b.csv", "import"), ("c.toml", "run")):
         (tmp_path / name).write_text("1,2\n")
         result = CliRunner().invoke(app, ["estimate", str(tmp_path / name)])
@@ -415,8 +414,7 @@ def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
     printed("init", "--out", str(bench))
     before = bench.read_text(encoding="utf-8")
     assert ": no errors." in printed("check", str(bench), "--no-devices")
-    refused = huddle("init", "--out", str(bench), code=2)
-    assert "--force replaces it" in " ".join(refused.stderr.split())
+    assert "--force replaces it" in words_of("init", "--out", str(bench), code=2)
     assert bench.read_text(encoding="utf-8") == before
 
 
@@ -443,8 +441,7 @@ def test_check_says_where_a_serial_number_cannot_be_checked() -> None:
 def test_serve_lists_the_next_runs_and_wants_cron_lines(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
     printed("init", "--out", str(bench))
-    result = huddle("serve", str(bench), "--list", code=2)
-    assert "schedule.cron" in result.stderr
+    assert "schedule.cron" in words_of("serve", str(bench), "--list", code=2)
     with bench.open("a", encoding="utf-8") as lines:
         lines.write('\n[schedule]\ncron = ["30 22 * * 1-5"]\ntime_zone = "Europe/Berlin"\n')
     times = json.loads(printed("serve", str(bench), "--list", "--json", "-"))["next"]

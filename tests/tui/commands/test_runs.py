@@ -21,7 +21,7 @@ from daq.errors import HuddleError
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.writer import RecordingWriter
-from tests.command import huddle, printed
+from tests.command import huddle, printed, words_of
 from tests.torture.damaged_files import make_recording
 from tests.tui.schemas import validate
 from tests.tui.service.bench_files import START
@@ -99,8 +99,7 @@ def test_verify_walks_what_is_kept(place: Path) -> None:
     content = bytearray(path.read_bytes())
     content[chunk.byte_offset : chunk.byte_offset + chunk.size] = bytes(chunk.size)
     path.write_bytes(content)
-    result = huddle("verify", str(place), code=3)
-    assert "1 of 1 recordings are damaged or lost" in result.stderr
+    assert "1 of 1 recordings are damaged or lost" in words_of("verify", str(place), code=3)
     path.unlink()
     printed("verify", str(place), code=3)
 

@@ -106,13 +106,3 @@ def test_the_status_line_of_every_view_says_simulated() -> None:
     assert not State("pier", bench=bench).caveats
     simulated_bench = bench.model_copy(update={"simulation": {"clock": "clock.json"}})
     assert State("pier", bench=simulated_bench).caveats
-
-
-def test_a_measured_recording_is_not_simulated(tmp_path: Path) -> None:
-    from tests.tui.night_recording import record  # noqa: PLC0415 - the other test needs none
-
-    path = record(tmp_path / "night.h5")
-    with Recording.open(path) as recording:
-        assert not recording.caveats
-    with h5py.File(path) as file:
-        assert "simulated" not in file.attrs

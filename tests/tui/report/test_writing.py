@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from daq.bench.masks.mask_file import masks_named
 from daq.devices.bench_file import load
-from tests.command import huddle
+from tests.command import huddle, words_of
 from tests.full_disk import files_limited_to
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import ROOT, Reported, Words
@@ -77,8 +77,7 @@ def test_a_draft_replaces_no_other_one_unless_forced(reported: Reported, tmp_pat
     huddle(*arguments, code=4)
     first = out.read_bytes()
     huddle(*arguments, code=4)  # the same once more changes nothing
-    refused = huddle(*arguments[:-1], "2s", code=3)
-    assert "exists with other content" in refused.stderr
+    assert "exists with other content" in words_of(*arguments[:-1], "2s", code=3)
     assert out.read_bytes() == first
     huddle(*arguments[:-1], "2s", "--force", code=4)
     page = Words(out.read_text(encoding="utf-8")).text

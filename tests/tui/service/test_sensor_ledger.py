@@ -21,7 +21,7 @@ from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
 from daq.results.result import Result
-from tests.command import huddle
+from tests.command import huddle, words_of
 from tui.commands.main import app
 from tui.service.history.ledger import ledger_path, noise_of, noted, record_test, sensor_tests
 from tui.web.months import Months
@@ -129,8 +129,7 @@ def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
     words = [each.text for each in drawn.iter("{http://www.w3.org/2000/svg}text")]
     assert words[:2] == ["S2", "2026-10-26, 1 to 16 Hz"]
     assert len(words) == 4  # two channels
-    unknown = huddle("history", "--sensor", "S9", code=2)
-    assert "no test in the ledger" in unknown.output
+    assert "no test in the ledger" in words_of("history", "--sensor", "S9", code=2)
     huddle("history", code=2)
 
 
