@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from daq.bench.masks.mask import Mask
     from daq.bench.model import Bench
-    from tui.page.blocks import Report
 
 
 class NotIssuedError(HuddleError, ValueError):
@@ -337,8 +336,11 @@ def _content(
     """Return the PDF, with its machine-readable forms inside."""
     about = examined.about
     report = report_of(result, examined.order.models, issue=made, about=about)
-    xml = dcc(result, issue=made, about=about)
-    return _pdf(report, _result(result, examined, made, roots), xml, made.at)
+    own, xml = _result(result, examined, made, roots), dcc(result, issue=made, about=about)
+    attached = [(JSON_NAME, "application/json", own), (DCC_NAME, "application/xml", xml)]
+    paper = io.BytesIO()
+    write_paper(report, paper, attached=attached, at=made.at)
+    return paper.getvalue()
 
 
 def with_stated(result: Result, examined: Examined) -> Result:
@@ -374,26 +376,6 @@ def _result(
         text["certificate"] |= {
             "decision_rule": rule.certificate.decision_rule,
             "guard_band": rule.certificate.guard_band,
-            "conformity": [
-                {
-                    "limit": each.limit,
-                    "sensor": each.sensor,
-                    "channel": each.channel,
-                    "statement": each.statement,
-                    "is_traceable": each.is_traceable,
-                    "k": each.k,
-                    "risk": each.risk,
-                    "frequency_hz": each.frequency,
-                }
-                for each in stated
-            ],
+            "conformity": stated,
         }
     return json_text(text).encode()
-
-
-def _pdf(report: Report, result: bytes, xml: bytes, at: datetime) -> bytes:
-    """Return the certificate with its machine-readable forms inside."""
-    paper = io.BytesIO()
-    attached = [(JSON_NAME, "application/json", result), (DCC_NAME, "application/xml", xml)]
-    write_paper(report, paper, attached=attached, at=at)
-    return paper.getvalue()

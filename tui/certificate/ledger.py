@@ -28,7 +28,6 @@ import sqlite3
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 from daq.bench.tables.certificate import CertificateTable
@@ -202,14 +201,13 @@ class Ledger:
         prefix: str,
         *,
         at: datetime,
-        by: str,
         recordings: Sequence[tuple[str, str, str]],
-        settings: Mapping[str, Any],
-        reason: str,
-        roots: Mapping[str, str] = MappingProxyType({}),
-        signer: str = "",
+        **about: Any,  # noqa: ANN401 - by their names, and in JSON
     ) -> LedgerEntry:
-        """Give the next number; a further certificate of the same runs is a revision of theirs."""
+        """Give the next number; a further certificate of the same runs is a revision of theirs.
+
+        The row has all else that is said about it, by the names of `LedgerEntry`.
+        """
         entries = self.entries()
         before = self.last_of(frozenset(run_id for _, run_id, _ in recordings), entries)
         if before is not None:
@@ -224,12 +222,8 @@ class Ledger:
             "number": number,
             "revision": revision,
             "at": at.isoformat(),
-            "by": by,
-            "recordings": [list(each) for each in recordings],
-            "settings": dict(settings),
-            "reason": reason,
-            "roots": dict(roots),
-            "signer": signer,
+            "recordings": recordings,
+            **about,
         }
         return _entry(record, self._add(record), "being issued")
 
@@ -288,38 +282,24 @@ class Ledger:
         part = _part(path)
         write_whole(part, content, mode=PRIVATE)
         sha256 = hashlib.sha256(content).hexdigest()
-        self._add(
-            {
-                "kind": "issued",
-                "number": entry.number,
-                "revision": entry.revision,
-                "at": datetime.now(UTC).isoformat(),
-                "file": path.name,
-                "sha256": sha256,
-            },
-            signer,
-        )
+        self._note("issued", entry, signer, file=path.name, sha256=sha256)
         _name(part, path)
         return path
 
     def void(self, entry: LedgerEntry, why: str) -> None:
         """Mark a number without a certificate, unless it has one that lacks only its name."""
-        if self._is_issued(entry):
+        key = "issued", entry.number, entry.revision
+        if any(key == (r["kind"], r["number"], r["revision"]) for r, _ in self._records()):
             return
         _part(self.folder / f"{entry.number}-r{entry.revision}.pdf").unlink(missing_ok=True)
-        self._add(
-            {
-                "kind": "void",
-                "number": entry.number,
-                "revision": entry.revision,
-                "at": datetime.now(UTC).isoformat(),
-                "why": why,
-            }
-        )
+        self._note("void", entry, why=why)
 
-    def _is_issued(self, entry: LedgerEntry) -> bool:
-        key = "issued", entry.number, entry.revision
-        return any(key == (r["kind"], r["number"], r["revision"]) for r, _ in self._records())
+    def _note(
+        self, kind: str, entry: LedgerEntry, signer: HeadSigner | None = None, **more: str
+    ) -> None:
+        """Add what became of a number."""
+        own = {"kind": kind, "number": entry.number, "revision": entry.revision}
+        self._add({**own, "at": datetime.now(UTC).isoformat(), **more}, signer)
 
     def signed_rows(self) -> dict[str, int]:
         """Return how many rows each key has signed, by its id.

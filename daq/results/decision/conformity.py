@@ -26,6 +26,7 @@ from daq.bench.tables.certificate import Rule
 from daq.results.decision.limits import Bands, ColumnLevels
 from estimator.decision.comparison import joint_quantile
 from estimator.decision.verdict import Obstacle
+from estimator.records import Hertz
 
 if TYPE_CHECKING:
     from daq.bench.model import Bench
@@ -76,7 +77,7 @@ class Conformity:
     channel: str
     statement: Statement
     risk: float
-    frequency: float
+    frequency: Hertz
     k: float
     is_traceable: bool
 
