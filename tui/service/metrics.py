@@ -15,7 +15,7 @@ from tui.output.extras import load
 from tui.service.records.run_state import Run, RunState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from daq.bench.tables.unattended import Metrics
     from tui.service.hooks import HookRunner
@@ -28,6 +28,13 @@ _NOISE = {
     "low": "Lower end of the 95 % interval of the mean noise",
     "high": "Upper end of the 95 % interval of the mean noise",
 }
+_OF_SENSOR = {
+    "samples": "Samples safe on disk.",
+    "missing": "Samples missing in gaps.",
+    "gaps": "Gaps.",
+}
+_LABELS = "sensor channel serial_number unit low_hz high_hz"
+_LEAST_FREE = "Space at which recordings end."
 PATIENCE, MAX_THREADS = 5.0, 64
 """Seconds for which a connection may be silent, and threads of the service with connections."""
 
@@ -97,88 +104,69 @@ class ServiceMetrics:
     def collect(self) -> Iterator[Any]:
         """Yield all metrics, as the library asks for them."""
         core = load("prometheus_client.core")
-
-        def gauge(name: str, text: str, value: float | None) -> Iterator[Any]:
-            if value is not None:
-                yield core.GaugeMetricFamily(name, text, value=value)
-
+        gauge, counter = core.GaugeMetricFamily, core.CounterMetricFamily
         service = self._service
-        window, bench = service.window, service.bench
-        runs = core.CounterMetricFamily(
-            "huddle_runs", "Runs since the start of the service.", labels=["state"]
+        window, planned = service.window, service.next_run
+        yield _family(
+            counter, "runs", "Runs since the start of the service.", "state", self._counts
         )
-        last = core.GaugeMetricFamily(
-            "huddle_last_run_timestamp_seconds", "End of the last run.", labels=["state"]
-        )
-        for state, count in self._counts.items():
-            runs.add_metric([state], count)
-            if state in self._last:
-                last.add_metric([state], self._last[state])
-        yield runs
-        yield last
-        recording = service.recording
-        yield from gauge("huddle_recording", "Whether a run is recorded.", recording is not None)
-        planned = service.next_run
-        yield from gauge(
-            "huddle_next_run_timestamp_seconds",
-            "Time at which the next run is due.",
-            None if planned is None else planned.due.timestamp(),
-        )
-        queue = core.GaugeMetricFamily("huddle_queue", "Runs that wait.", labels=["for"])
-        for name, number in zip(("recording", "estimate"), service.waiting, strict=True):
-            queue.add_metric([name], number)
-        yield queue
-        yield from gauge("huddle_disk_free_bytes", "Free space.", service.free())
-        least = bench.storage.min_free
-        yield from gauge("huddle_disk_min_free_bytes", "Space at which recordings end.", least)
-        yield core.CounterMetricFamily(
-            "huddle_hooks_given_up", "Hooks without success.", value=self._hook_runner.n_failed
-        )
+        name = "last_run_timestamp_seconds"
+        yield _family(gauge, name, "End of the last run.", "state", self._last)
+        due = None if planned is None else planned.due.timestamp()
+        for name, text, value in (
+            ("recording", "Whether a run is recorded.", service.recording is not None),
+            ("next_run_timestamp_seconds", "Time at which the next run is due.", due),
+            ("disk_free_bytes", "Free space.", service.free()),
+            ("disk_min_free_bytes", _LEAST_FREE, service.bench.storage.min_free),
+        ):
+            if value is not None:
+                yield gauge(f"huddle_{name}", text, value=value)
+        waiting = dict(zip(("recording", "estimate"), service.waiting, strict=True))
+        yield _family(gauge, "queue", "Runs that wait.", "for", waiting)
+        n_failed = self._hook_runner.n_failed
+        yield counter("huddle_hooks_given_up", "Hooks without success.", value=n_failed)
         status = None if window is None else window.status
         if status is not None:
-            yield from _sensors(core, status)
-        yield core.InfoMetricFamily(
-            "huddle_build", "This copy of huddle.", {"version": __version__, "python": PYTHON}
-        )
+            yield from _sensors(gauge, status.get("sensors", {}))
+        own = {"version": __version__, "python": PYTHON}
+        yield core.InfoMetricFamily("huddle_build", "This copy of huddle.", own)
         if self._done is not None:
-            yield from _result(core, self._done)
+            yield from _result(gauge, self._done)
 
 
-def _sensors(core: Any, status: dict[str, Any]) -> Iterator[Any]:  # noqa: ANN401 - a module
-    names = ("samples", "missing", "gaps")
-    texts = ("Samples safe on disk.", "Samples missing in gaps.", "Gaps.")
-    families = [
-        core.GaugeMetricFamily(
-            f"huddle_sensor_{name}", f"{text} Of the recording that runs.", labels=["sensor"]
-        )
-        for name, text in zip(names, texts, strict=True)
-    ]
-    state = core.GaugeMetricFamily(
-        "huddle_sensor_state", "1 for the state that the sensor has.", labels=["sensor", "state"]
-    )
-    for sensor, found in status.get("sensors", {}).items():
-        for name, family in zip(names, families, strict=True):
-            family.add_metric([sensor], found[name])
-        state.add_metric([sensor, str(found["state"])], 1)
-    yield from families
-    yield state
+def _family(
+    kind: Any,  # noqa: ANN401 - of the library
+    name: str,
+    text: str,
+    labels: str,
+    values: Mapping[Any, float],
+) -> Any:  # noqa: ANN401
+    """Return a metric with a value for each of its labels, or for several of them together."""
+    found = kind(f"huddle_{name}", text, labels=labels.split())
+    for labelled, value in values.items():
+        found.add_metric(labelled if isinstance(labelled, tuple) else (labelled,), value)
+    return found
 
 
-def _result(core: Any, run: Run) -> Iterator[Any]:  # noqa: ANN401 - a module
-    labels = ["sensor", "channel", "serial_number", "unit", "low_hz", "high_hz"]
+def _sensors(gauge: Any, sensors: Mapping[str, Any]) -> Iterator[Any]:  # noqa: ANN401
+    for name, text in _OF_SENSOR.items():
+        found = {sensor: each[name] for sensor, each in sensors.items()}
+        about = f"{text} Of the recording that runs."
+        yield _family(gauge, f"sensor_{name}", about, "sensor", found)
+    states = {(sensor, str(each["state"])): 1 for sensor, each in sensors.items()}
+    text = "1 for the state that the sensor has."
+    yield _family(gauge, "sensor_state", text, "sensor state", states)
+
+
+def _result(gauge: Any, run: Run) -> Iterator[Any]:  # noqa: ANN401
+    of = [tuple(str(getattr(each, label)) for label in _LABELS.split()) for each in run.noise]
     for name, text in _NOISE.items():
-        family = core.GaugeMetricFamily(
-            f"huddle_noise_{name}", f"{text} of the last run in unit²/Hz.", labels=labels
-        )
-        for each in run.noise:
-            family.add_metric([str(getattr(each, label)) for label in labels], getattr(each, name))
-        yield family
-    verdict = core.GaugeMetricFamily(
-        "huddle_verdict", "1 for the verdict of the last run on its limits.", labels=["verdict"]
-    )
-    for known in Verdict if run.verdict else ():
-        verdict.add_metric([known.value], known.value == run.verdict)
-    yield verdict
+        values = dict(zip(of, (getattr(each, name) for each in run.noise), strict=True))
+        about = f"{text} of the last run in unit²/Hz."
+        yield _family(gauge, f"noise_{name}", about, _LABELS, values)
+    verdicts = {known.value: known.value == run.verdict for known in Verdict if run.verdict}
+    text = "1 for the verdict of the last run on its limits."
+    yield _family(gauge, "verdict", text, "verdict", verdicts)
     for caveat in Caveat:
         about = f"Whether the last run has {caveat.words.noun}."
-        yield core.GaugeMetricFamily(f"huddle_{caveat}", about, value=caveat in run.caveats)
+        yield gauge(f"huddle_{caveat}", about, value=caveat in run.caveats)
