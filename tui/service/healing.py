@@ -11,7 +11,6 @@ was due when the recording began.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 from dataclasses import replace
@@ -20,10 +19,9 @@ from typing import TYPE_CHECKING
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
-from daq.recording.signing import identity
 from daq.recording.storage.locking import is_being_written
 from tui.service.planning import GRACE, missed_runs
-from tui.service.records.parts import mark_of
+from tui.service.records.parts import identities, mark_of
 from tui.service.records.run_state import RUN, Run, RunState
 
 if TYPE_CHECKING:
@@ -55,7 +53,9 @@ def heal(store: RunStore, bench: Bench, now: datetime) -> bool:
     n_found = 0
     for run in _runs_of_recordings(bench, store.parts() - unfinished, unfinished):
         store.save(run)
-        store.set_identities(run, list(_identities(bench.recording_directory, run)))
+        over = run.parts if run.is_over else ()
+        found = identities(bench.recording_directory / part for part in over)
+        store.set_identities(run, list(found))
         n_found += 1
     if is_lost and not n_found:  # a new one
         return False
@@ -87,14 +87,6 @@ def _runs_of_recordings(bench: Bench, known: set[str], unfinished: set[str]) -> 
             if run is not None and (run.is_over or path.name not in unfinished):
                 known.update(run.parts)
                 yield run
-
-
-def _identities(folder: Path, run: Run) -> Iterator[tuple[str, str, str]]:
-    """Yield file name, run id and root SHA-256 of the recordings of a run that is over."""
-    for part in run.parts if run.is_over else ():
-        with contextlib.suppress(HuddleError, OSError):
-            run_id, root = identity(folder / part)
-            yield part, run_id, root
 
 
 def _run_of(bench: Bench, path: Path) -> Run | None:

@@ -19,6 +19,9 @@ Found = tuple[str, datetime, RecordedNoise, Caveats]
 SCATTER = 0.1
 """Standard deviation in dB from run to run that is no change."""
 FALSE_ALARMS = 0.01
+_OF_CHANNEL = (
+    *("sensor", "channel", "model", "serial_number", "unit", "method", "low_hz", "high_hz"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +70,9 @@ class NoiseSeries:
 
     def document(self) -> dict[str, Any]:
         """Return the series as JSON (docs/service.md)."""
-        last = self.last
         return {
-            "sensor": last.sensor,
-            "channel": last.channel,
-            "model": last.model,
-            "serial_number": last.serial_number,
+            **{name: getattr(self.last, name) for name in _OF_CHANNEL},
             **self.caveats.keys,
-            "unit": last.unit,
-            "method": last.method,
-            "low_hz": last.low_hz,
-            "high_hz": last.high_hz,
             "runs": [
                 {
                     "bench": bench,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape
 
@@ -55,16 +56,9 @@ def history_figure(found: Sequence[NoiseSeries]) -> Figure:
                 middle = [decibels(each.psd) for each in noise]
                 below = [decibels(each.psd) - decibels(each.low) for each in noise]
                 above = [decibels(each.high) - decibels(each.psd) for each in noise]
-                panel.errorbar(
-                    dates,
-                    middle,
-                    yerr=[below, above],
-                    fmt="o-",
-                    markersize=3,
-                    linewidth=0.7,
-                    color=colour,
-                    label=series.last.channel,
-                )
+                bars = partial(panel.errorbar, fmt="o-", markersize=3, linewidth=0.7)
+                ends, label = [below, above], series.last.channel
+                bars(dates, middle, yerr=ends, color=colour, label=label)
                 for change in series.changes:
                     panel.axvline(series.due_of(change.first), color=colour, linestyle="--")
             panel.set_title(f"{sensor}, {low:.3g} to {high:.3g} Hz", loc="left")

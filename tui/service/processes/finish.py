@@ -28,7 +28,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.recording.reader import Recording
 from daq.recording.repair import repair
-from daq.recording.signing import identity, sign, signature_of
+from daq.recording.signing import sign, signature_of
 from daq.results.result import Result
 from daq.results.store import store_results
 from daq.whole_file import remove_parts
@@ -40,7 +40,7 @@ from tui.output.logs.lines import configure
 from tui.output.logs.options import LogFormat
 from tui.runs.estimate_settings import chosen
 from tui.service.history.ledger import band_noise, noted
-from tui.service.records.parts import with_continuations
+from tui.service.records.parts import identities, with_continuations
 from tui.service.records.run_state import RUN, RecordedNoise
 
 MEMORY_SHARE = 0.6
@@ -148,16 +148,7 @@ def finish(request: Request, progress: Callable[[], object] = lambda: None) -> O
     except (HuddleError, EstimatorError, OSError) as error:
         outcome = Outcome(error=str(error) or type(error).__name__, refused=is_of_disk(error))
     names = tuple(part.name for part in parts)
-    return replace(outcome, parts=names, identities=tuple(_identities(parts)))
-
-
-def _identities(parts: Sequence[Path]) -> Iterator[tuple[str, str, str]]:
-    """Yield file name, run id and root SHA-256 of the recordings that are closed."""
-    for part in parts:
-        with contextlib.suppress(HuddleError, OSError):
-            run_id, root = identity(part)
-            if root:
-                yield part.name, run_id, root
+    return replace(outcome, parts=names, identities=tuple(identities(parts)))
 
 
 def _signed(parts: Sequence[Path], key: Path) -> Iterator[str]:

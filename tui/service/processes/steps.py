@@ -11,6 +11,7 @@ import contextlib
 import json
 import sys
 from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -28,7 +29,6 @@ from tui.service.records.parts import mark_of, with_continuations
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
-    from collections.abc import Iterator
     from datetime import datetime
 
     from daq.bench.end_condition import EndCondition
@@ -112,7 +112,8 @@ class ProcessSteps:
         first = recording_path(self._bench, HostTime(0, round(at.timestamp() * 1e9)))
         try:
             first.parent.mkdir(parents=True, exist_ok=True)
-            for out in _numbered(first):
+            others = (first.with_stem(f"{first.stem}-{number}") for number in count(2))
+            for out in chain([first], others):
                 with contextlib.suppress(FileExistsError):
                     mark_of(out).touch(mode=0o600, exist_ok=False)
                     if not out.exists():
@@ -352,11 +353,3 @@ async def _status(out: Path) -> dict[str, Any] | None:
     except (HuddleError, OSError, ValueError):
         return None
     return answer if isinstance(answer.get("elapsed"), (int, float)) else None
-
-
-def _numbered(first: Path) -> Iterator[Path]:
-    yield first
-    number = 2
-    while True:
-        yield first.with_stem(f"{first.stem}-{number}")
-        number += 1

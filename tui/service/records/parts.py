@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
+from daq.recording.signing import identity
 from daq.recording.storage.journal import journal_path
 from daq.recording.storage.names import continuation_names
 
@@ -33,6 +35,15 @@ def with_continuations(parts: Iterable[Path]) -> list[Path]:
 def mark_of(recording: Path) -> Path:
     """Return the mark beside a recording of the service whose run is not over; also its lock."""
     return recording.with_name(f".{recording.name}.run")
+
+
+def identities(recordings: Iterable[Path]) -> Iterator[tuple[str, str, str]]:
+    """Yield file name, run id and root SHA-256 of those that are closed."""
+    for path in recordings:
+        with suppress(HuddleError, OSError):
+            run_id, root = identity(path)
+            if root:
+                yield path.name, run_id, root
 
 
 def _run_ids(path: Path) -> tuple[str, str] | None:

@@ -15,6 +15,7 @@ import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from datetime import date, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -139,30 +140,25 @@ class RunStore:
 
     def pin(self, keys: Sequence[str], *, pinned: bool) -> None:
         """Keep these runs whatever the limits of storage, or no longer."""
-        with self._changed() as database:
-            database.executemany(
-                "UPDATE runs SET pinned = ? WHERE key = ?", [(int(pinned), key) for key in keys]
-            )
+        self._write("UPDATE runs SET pinned = ? WHERE key = ?", *((int(pinned), k) for k in keys))
 
     def set_pending_hooks(self, run: Run, events: Sequence[str]) -> None:
         """Write which hooks of a run have still to be carried out."""
-        with self._changed() as database:
-            database.execute(
-                "UPDATE runs SET untold = ? WHERE key = ?", (json.dumps(list(events)), run.key)
-            )
+        pending = json.dumps(list(events))
+        self._write("UPDATE runs SET untold = ? WHERE key = ?", (pending, run.key))
 
     def set_removed(self, run: Run, when: datetime) -> None:
         """Write that the files of a run were removed."""
-        with self._changed() as database:
-            database.execute("UPDATE runs SET removed = ? WHERE key = ?", (utc_text(when), run.key))
+        self._write("UPDATE runs SET removed = ? WHERE key = ?", (utc_text(when), run.key))
 
     def set_identities(self, run: Run, identities: Sequence[tuple[str, str, str]]) -> None:
         """Write file name, run id and root SHA-256 of the recordings of a run."""
+        rows = ((part, run.key, run_id, root) for part, run_id, root in identities)
+        self._write("INSERT OR REPLACE INTO identities VALUES (?, ?, ?, ?)", *rows)
+
+    def _write(self, statement: str, *rows: tuple[object, ...]) -> None:
         with self._changed() as database:
-            database.executemany(
-                "INSERT OR REPLACE INTO identities VALUES (?, ?, ?, ?)",
-                [(part, run.key, run_id, root) for part, run_id, root in identities],
-            )
+            database.executemany(statement, rows)
 
     def identities(self) -> dict[str, tuple[str, str]]:
         """Return run id and root SHA-256 of recordings, by file name."""
@@ -186,10 +182,7 @@ class RunStore:
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
         self._saved.discard(run.key)
-        with self._changed() as database:
-            database.execute(
-                "DELETE FROM runs WHERE key = ? AND state = ?", (run.key, RunState.DUE)
-            )
+        self._write("DELETE FROM runs WHERE key = ? AND state = ?", (run.key, RunState.DUE))
 
     def runs(
         self,
@@ -276,13 +269,10 @@ class RunStore:
             f"{where} ORDER BY due, entry, noise.rowid",
             *values,
         )
-        moments: dict[str, datetime] = {}
+        moment = lru_cache(maxsize=1)(datetime.fromisoformat)  # of many rows in turn
         for name, due, *row in rows:
-            moment = moments.get(due)
-            if moment is None:
-                moment = moments[due] = datetime.fromisoformat(due)
             caveats = Caveats.of(dict(zip(Caveat, row, strict=False)))
-            yield name, moment, RecordedNoise.of(*row[len(Caveat) :]), caveats
+            yield name, moment(due), RecordedNoise.of(*row[len(Caveat) :]), caveats
 
     def _found(
         self,
