@@ -60,8 +60,16 @@ _REFERENCE = re.compile(r'(?:url\(#|href="#)([^")]+)')
 
 DASHES = ((4, 1.2), (1.2, 1.2), (6, 1.2, 1.2, 1.2), (6, 1.2, 1.2, 1.2, 1.2, 1.2))
 """Of lines that are told apart without colour."""
+_CHANNEL_DASHES = ((None, None), (4, 1.5), (1, 1))
+"""Of the channels of a sensor."""
 MODEL_DASHES = ((7, 2), (6, 1.5, 1, 1.5), (2.5, 1.2), (6, 1.5, 1, 1.5, 1, 1.5))
 """Of noise models; none is dotted, as the band and the quantisation are."""
+
+
+def style_of(number: int) -> tuple[str, tuple[float | None, ...]]:
+    """Return colour and dashes of one of several lines: told apart without colours, too."""
+    return LINES[number % len(LINES)], _CHANNEL_DASHES[number % 3]
+
 
 LEFT, GAP, TOP, TITLE, BOTTOM, KEY_ROW = 0.52, 0.14, 0.06, 0.14, 0.38, 0.14
 """Room left of a row of axes, between them, above, for titles, below, and for a row of the key."""

@@ -9,7 +9,6 @@ from itertools import groupby
 import numpy as np
 
 from daq.bench.units import decibels
-from daq.clocks.clock_model import ClockState
 from daq.errors import HuddleError
 from daq.estimation.snapshot import Snapshot
 from daq.protocols.block import EventKind
@@ -65,34 +64,23 @@ def model_test_section(result: Result) -> Section:
 
     grouped = [(failing, list(run)) for failing, run in groupby(tested, key=fails)]
     runs = [run for failing, run in grouped if failing]
-    parts: list[Part] = []
+    tone: Tone = "doubtful"
     if runs:
-        where = "; ".join(_run_in_words(run) for run in runs)
-        parts.append(
-            Paragraph(
-                f"The test fails at {where}. There the sensors do not sense, or do not report, the "
-                "same motion. What they do not share counts as noise.",
-                "bad" if any(_ratio(band) > 2 for run in runs for band in run) else "doubtful",
-            )
+        text = (
+            f"The test fails at {'; '.join(map(_run_in_words, runs))}. There the sensors do not"
+            " sense, or do not report, the same motion. What they do not share counts as noise."
         )
-        if len(runs[0]) < len(tested):
-            parts.append(
-                Paragraph("Elsewhere one common motion explains what they have in common.")
-            )
+        tone = "bad" if any(_ratio(band) > 2 for run in runs for band in run) else tone
     elif any(isinstance(advice, NoSharedMotion) for advice in found.advice):
-        parts.append(
-            Paragraph(
-                "The test passes: it cannot show that a sensor records another motion. See the "
-                "advice.",
-                "doubtful",
-            )
-        )
+        text = "The test passes: it cannot show that a sensor records another motion."
+        text += " See the advice."
     else:
-        parts.append(
-            Paragraph(
-                "One common motion explains what the sensors have in common, in all bands.", "good"
-            )
-        )
+        text = "One common motion explains what the sensors have in common, in all bands."
+        tone = "good"
+    parts: list[Part] = [Paragraph(text, tone)]
+    if runs and len(runs[0]) < len(tested):
+        text = "Elsewhere one common motion explains what they have in common."
+        parts.append(Paragraph(text))
     plot = model_test_plot(result)
     if plot is not None:
         parts += [
@@ -178,15 +166,24 @@ def clocks_section(result: Result) -> Section:
             text += " Give the sensors one clock, or record longer for their rates to be known."
         parts.append(Paragraph(text, tone))
     left, against = residuals(snapshot), reference(snapshot)
-    rows = [
-        _clock_row(
-            clock,
-            effects.get(clock.sensor, math.nan),
-            left.get(clock.sensor, math.nan),
-            is_reference=clock.sensor == against,
+    rows = []
+    for clock in snapshot.clocks:
+        n_restarts, error = clock.n_epochs - 1, left.get(clock.sensor, math.nan)
+        restarts = f", {several(n_restarts, 'restart')}" if n_restarts > 0 else ""
+        refined = "yes" if clock.refined else "no"
+        rows.append(
+            (
+                clock.sensor,
+                clock_source(clock) + restarts,
+                plain_number(clock.offset * 1e3, ".3f"),
+                plain_number(clock.ppm, "+.3f"),
+                f"{clock.ppm_std:.2g}",
+                scientific(clock.wander_ppm, 2),
+                "–" if error == 0 else plain_number(error * 1e6, ".2f"),
+                "the others against it" if clock.sensor == against else refined,
+                share(effects.get(clock.sensor, math.nan)),
+            )
         )
-        for clock in snapshot.clocks
-    ]
     header = (
         "sensor", "time from", "offset (ms)", "rate (ppm)", "±", "wander (ppm)",
         "error (µs rms)", "refined by motion", "of the noise",
@@ -320,24 +317,6 @@ def _reversed(snapshot: Snapshot, response: RelativeResponse) -> str:
     first = sum(snapshot.dims[: response.second])
     channels = (snapshot.channels[first + number] for number in response.reversed_channels)
     return ", ".join(label.channel for label in channels)
-
-
-def _clock_row(
-    clock: ClockState, effect: float, left: float, *, is_reference: bool
-) -> tuple[str, ...]:
-    refined = "the others against it" if is_reference else "yes" if clock.refined else "no"
-    return (
-        clock.sensor,
-        clock_source(clock)
-        + (f", {several(clock.n_epochs - 1, 'restart')}" if clock.n_epochs > 1 else ""),
-        plain_number(clock.offset * 1e3, ".3f"),
-        plain_number(clock.ppm, "+.3f"),
-        f"{clock.ppm_std:.2g}",
-        scientific(clock.wander_ppm, 2),
-        "–" if left == 0 else plain_number(left * 1e6, ".2f"),
-        refined,
-        share(effect),
-    )
 
 
 def _together(logged_events: Iterable[LoggedEvent]) -> list[tuple[LoggedEvent, int, int]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,8 @@ from tui.page.ticks import set_log_ticks
 from tui.wording.formatting import power_of_ten
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
     from tui.page.axes import Axes
@@ -29,50 +32,31 @@ if TYPE_CHECKING:
 HEIGHT = 0.8
 
 
-@dataclass(frozen=True, slots=True)
-class _AllanPanel:
-    """Draws the Allan deviation of one sensor's channels."""
-
-    name: str
-    channels: tuple[ChannelParameters, ...]
-    unit: str
-    scale: tuple[float, float]
-
-    def __call__(self, axes: Axes) -> None:
-        for number, each in enumerate(self.channels):
-            if each.allan is None:
-                continue
-            colour = drawing.LINES[number % len(drawing.LINES)]
-            dashes = [(), (4, 1.5), (1, 1)][number % 3]  # told apart without colours, too
-            found = each.allan
-            known = found.deviation > 0
-            axes.fill_between(
-                found.tau[known], found.low[known], found.high[known], color=colour, alpha=0.2, lw=0
-            )
-            axes.plot(
-                found.tau[known],
-                found.deviation[known],
-                color=colour,
-                dashes=dashes or (None, None),
-                lw=0.9,
-                label=each.label.channel,
-            )
-        times = np.concatenate([each.allan.tau for each in self.channels if each.allan is not None])
-        room = max(1.1, (times.max() / times.min()) ** 0.05)
-        span = float(times.min() / room), float(times.max() * room)
-        axes.set(
-            title=self.name,
-            xscale="log",
-            yscale="log",
-            xlim=span,
-            ylim=self.scale,
-            xlabel="averaging time (s)",
-            ylabel=f"σ ({self.unit})",
-        )
-        set_log_ticks(axes.xaxis, *span, "{:g}".format, digits=(1, 2, 5))
-        set_log_ticks(
-            axes.yaxis, *self.scale, lambda at: power_of_ten(math.log10(at)), has_minor=False
-        )
+def _draw_allan(
+    channels: Sequence[ChannelParameters],
+    name: str,
+    unit: str,
+    scale: tuple[float, float],
+    axes: Axes,
+) -> None:
+    """Draw the Allan deviation of one sensor's channels, of which each number has its colour."""
+    times = []
+    for number, each in enumerate(channels):
+        found = each.allan
+        if found is None:
+            continue
+        colour, dashes = drawing.style_of(number)
+        known = found.deviation > 0
+        tau, label = found.tau[known], each.label.channel
+        axes.fill_between(tau, found.low[known], found.high[known], color=colour, alpha=0.2, lw=0)
+        axes.plot(tau, found.deviation[known], color=colour, dashes=dashes, lw=0.9, label=label)
+        times += [found.tau.min(), found.tau.max()]
+    room = max(1.1, (max(times) / min(times)) ** 0.05)
+    span = float(min(times) / room), float(max(times) * room)
+    axes.set(title=name, xlabel="averaging time (s)", ylabel=f"σ ({unit})")
+    axes.set(xscale="log", yscale="log", xlim=span, ylim=scale)
+    set_log_ticks(axes.xaxis, *span, "{:g}".format, digits=(1, 2, 5))
+    set_log_ticks(axes.yaxis, *scale, lambda at: power_of_ten(math.log10(at)), has_minor=False)
 
 
 def parameters_section(result: Result) -> Section | None:
@@ -122,6 +106,7 @@ def _plots(found: tuple[ChannelParameters, ...], snapshot: Snapshot) -> list[Plo
     for sensor in snapshot.sensor_names:
         channels = tuple(each for each in found if each.label.sensor == sensor)
         if any(each.allan is not None and (each.allan.deviation > 0).any() for each in channels):
-            panels.append(_AllanPanel(f"Sensor {sensor}", channels, snapshot.unit, scale))
+            draw = partial(_draw_allan, channels, f"Sensor {sensor}", snapshot.unit, scale)
+            panels.append(draw)
     alt = "Allan deviation of the noise against averaging time"
     return three_to_a_row(panels, "", height=HEIGHT, alt=alt)

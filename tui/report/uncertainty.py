@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -151,32 +151,24 @@ def _half_octaves(result: Result, about: Bench | None, names: Sequence[str]) -> 
         parts += _diagrams(snapshot, centres, rms, full)
     most = max(1, min(COLUMNS, int(MOST_LETTERS / max(map(len, names)))))
     n_tables = math.ceil(len(names) / most)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        reach = 20 * np.log10(full / math.sqrt(2) / rms)
+    of_noise = f"Self-noise in half octaves, rms in {snapshot.unit}"
+    of_range = (
+        "Operating range in half octaves: from the noise to a sine of full scale, rms over rms, in"
+        " dB"
+    )
     for columns in np.array_split(np.arange(len(names)), n_tables):
         some = slice(int(columns[0]), int(columns[-1]) + 1)
-        parts.append(
-            Table(
-                ("Hz", *names[some]),
-                tuple(
-                    (f"{centre:.3g}", *(scientific(value, 3) for value in row[some]))
-                    for centre, row in zip(centres, rms, strict=True)
-                ),
-                title=f"Self-noise in half octaves, rms in {snapshot.unit}",
-            )
-        )
+        shown = [(rms, lambda value: scientific(value, 3), of_noise)]
         if np.isfinite(full[some]).any():
-            with np.errstate(invalid="ignore", divide="ignore"):
-                reach = 20 * np.log10(full / math.sqrt(2) / rms)
-            parts.append(
-                Table(
-                    ("Hz", *names[some]),
-                    tuple(
-                        (f"{centre:.3g}", *(plain_number(value, ".1f") for value in row[some]))
-                        for centre, row in zip(centres, reach, strict=True)
-                    ),
-                    title="Operating range in half octaves: from the noise to a sine of full "
-                    "scale, rms over rms, in dB",
-                )
+            shown.append((reach, lambda value: plain_number(value, ".1f"), of_range))
+        for values, show, title in shown:
+            rows = (
+                (f"{centre:.3g}", *map(show, row[some]))
+                for centre, row in zip(centres, values, strict=True)
             )
+            parts.append(Table(("Hz", *names[some]), tuple(rows), title=title))
     parts.append(
         Paragraph(
             "Half octaves about powers of √2, as strong-motion users state noise and range: rms of "
@@ -189,39 +181,32 @@ def _half_octaves(result: Result, about: Bench | None, names: Sequence[str]) -> 
     return parts
 
 
-@dataclass(frozen=True, slots=True)
-class _Range:
-    """Draws the rms in half octaves of one sensor's channels, up to a sine of full scale."""
-
-    sensor: str
-    names: tuple[str, ...]
-    centres: FloatArray
-    rms_db: FloatArray
-    full_db: FloatArray
-    unit: str
-    scale: tuple[float, float]
-
-    def __call__(self, axes: Axes) -> None:
-        logarithmic(axes, (float(self.centres[0]) / HALF, float(self.centres[-1]) * HALF))
-        ends = np.append(self.centres / HALF, self.centres[-1] * HALF)
-        steps = np.repeat(ends, 2)[1:-1]
-        for number, name in enumerate(self.names):
-            dashes = [(), (4, 1.5), (1, 1.65)][number % 3]  # told apart without colours, too
-            colour = drawing.LINES[number % len(drawing.LINES)]
-            values = np.repeat(self.rms_db[:, number], 2)
-            axes.plot(
-                steps, values, color=colour, dashes=dashes or (None, None), lw=1.0, label=name
-            )
-        clips = self.full_db[np.isfinite(self.full_db)]
-        if clips.size:
-            level = np.full(2, clips.min())
-            dashes = (6.4, 1.6, 1, 1.6)  # told apart from dashed channels in grey, too
-            label = "sine of full scale"
-            axes.plot(ends[[0, -1]], level, color=drawing.LIMIT, lw=1.0, dashes=dashes, label=label)
-        ylabel = f"dB re 1 {self.unit} rms"
-        axes.set(title=f"Sensor {self.sensor}", ylim=self.scale, ylabel=ylabel)
-        levels = even_ticks(*self.scale, 6)
-        axes.yaxis.set_ticks(levels, [f"{each:.0f}".replace("-", "−") for each in levels])
+def _draw_range(
+    names: Sequence[str],
+    centres: FloatArray,
+    levels_db: tuple[FloatArray, FloatArray],
+    scale: tuple[float, float],
+    axes: Axes,
+    *,
+    sensor: str,
+    unit: str,
+) -> None:
+    """Draw the rms in half octaves of one sensor's channels, up to a sine of full scale."""
+    rms_db, full_db = levels_db
+    logarithmic(axes, (float(centres[0]) / HALF, float(centres[-1]) * HALF))
+    ends = np.append(centres / HALF, centres[-1] * HALF)
+    draw, steps = partial(axes.plot, lw=1.0), np.repeat(ends, 2)[1:-1]
+    for number, (name, values) in enumerate(zip(names, rms_db.T, strict=True)):
+        colour, dashes = drawing.style_of(number)
+        draw(steps, np.repeat(values, 2), color=colour, dashes=dashes, label=name)
+    clips = full_db[np.isfinite(full_db)]
+    if clips.size:
+        level, label = np.full(2, clips.min()), "sine of full scale"
+        dashes = (6.4, 1.6, 1, 1.6)  # told apart from dashed channels in grey, too
+        draw(ends[[0, -1]], level, color=drawing.LIMIT, dashes=dashes, label=label)
+    axes.set(title=f"Sensor {sensor}", ylim=scale, ylabel=f"dB re 1 {unit} rms")
+    levels = even_ticks(*scale, 6)
+    axes.yaxis.set_ticks(levels, [f"{each:.0f}".replace("-", "−") for each in levels])
 
 
 def _diagrams(
@@ -238,9 +223,9 @@ def _diagrams(
     for sensor in snapshot.sensor_names:
         own = [n for n, label in enumerate(snapshot.channels) if label.sensor == sensor]
         names = tuple(snapshot.channels[n].channel for n in own)
-        panels.append(
-            _Range(sensor, names, centres, rms_db[:, own], full_db[own], snapshot.unit, scale)
-        )
+        levels = rms_db[:, own], full_db[own]
+        draw = partial(_draw_range, names, centres, levels, scale)
+        panels.append(partial(draw, sensor=sensor, unit=snapshot.unit))
     alt = "Noise in half octaves against frequency, below a sine of full scale"
     return three_to_a_row(panels, "Operating range in half octaves", height=1.6, alt=alt)
 

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from estimator.types import FloatArray
     from tui.page.axes import Axes
 
-    BoolArray = NDArray[np.bool_]
 
 POINTS = 240
 """Most points of a curve: more than print resolves. Each is a mean over its share of the axis."""
@@ -323,23 +322,10 @@ def _amplitude_scale(axes: Axes, scale: tuple[float, float], unit: str) -> None:
 def _nothing(axes: Axes, edges: FloatArray, noise: BandMeans) -> None:
     """Shade where nothing can be said: no number, or all of its interval below zero."""
     unknown = ~(np.isfinite(noise.mean) & (noise.high > 0))
-    for start, stop in _runs(unknown):
-        axes.axvspan(
-            float(edges[start]),
-            float(edges[stop]),
-            color=drawing.NOTHING,
-            alpha=0.4,
-            lw=0,
-            zorder=0.5,
-            label="nothing can be said",
-        )
-
-
-def _runs(true: BoolArray) -> Iterator[tuple[int, int]]:
-    """Yield first and last + 1 of each run."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], true, [False])).astype(np.int8)))
-    for first, stop in edges.reshape(-1, 2):
-        yield int(first), int(stop)
+    ends = edges[np.flatnonzero(np.diff(unknown, prepend=False, append=False))]
+    shade = partial(axes.axvspan, color=drawing.NOTHING, alpha=0.4, lw=0, zorder=0.5)
+    for start, stop in ends.reshape(-1, 2).tolist():
+        shade(start, stop, label="nothing can be said")
 
 
 def logarithmic(axes: Axes, span: tuple[float, float]) -> None:

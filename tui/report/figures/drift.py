@@ -81,9 +81,8 @@ def _draw(seconds: FloatArray, left: FloatArray, names: list[str], axes: Axes) -
     time = seconds / one
     unit, size = ("ms", 1e3) if largest >= 1e-3 else ("µs", 1e6)
     for number, (column, name) in enumerate(zip(left.T, names, strict=True)):
-        dashes = [(), (4, 1.5), (1, 1)][number % 3]  # told apart without colours, too
-        colour = drawing.LINES[number % len(drawing.LINES)]
-        axes.plot(time, size * column, color=colour, dashes=dashes or (None, None), label=name)
+        colour, dashes = drawing.style_of(number)
+        axes.plot(time, size * column, color=colour, dashes=dashes, label=name)
     end = float(time[0] + time[-1])
     ends = size * float(np.nanmin(left)), size * float(np.nanmax(left))
     room = 0.05 * (ends[1] - ends[0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -91,7 +90,8 @@ def _spectra(
         n_times, n_bands = (TIMES, BANDS) if is_fine else COARSE
         found = signal.spectrogram(number, span, n_times, n_bands, snapshot=snapshot, noise=noise)
         if found is not None:
-            panels.append(_Spectrum(found, span, f"{trace.name}, {name}", is_fine))
+            draw = partial(_draw_spectrum, found, span, f"{trace.name}, {name}")
+            panels.append(partial(draw, is_fine=is_fine))
     if panels:
         alt = f"Power spectral density of {trace.name} against time and frequency"
         yield Plot("", tuple(panels), 2, SPECTRUM_HEIGHT, alt, titled=True)
@@ -106,14 +106,9 @@ def _time_axis(axes: Axes, span: tuple[float, float], most: int = TICKS) -> None
 def _draw_waveforms(view: Waveforms, axes: Axes) -> None:
     times = np.linspace(view.begin, view.end, 2 * view.n_columns + 1)[1::2]
     for row, trace in enumerate(view.traces):
-        low, high = trace.scaled
-        axes.fill_between(
-            times,
-            _CYCLE * low - row,
-            _CYCLE * high - row,
-            color=drawing.NOISE if not trace.is_auxiliary else drawing.DATA,
-            lw=0.4,
-        )
+        low, high = (_CYCLE * end - row for end in trace.scaled)
+        colour = drawing.DATA if trace.is_auxiliary else drawing.NOISE
+        axes.fill_between(times, low, high, color=colour, lw=0.4)
     for row, trace in enumerate(view.traces):
         right = view.end + 0.005 * (view.end - view.begin)
         axes.text(right, -row, extent(trace), va="center", size=5)
@@ -141,30 +136,16 @@ def _draw_mark(axes: Axes, mark: Mark, column: float) -> None:
         axes.axvline(mark.begin, color=drawing.INK, lw=width, dashes=dashes)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Spectrum:
-    """Draws a spectrogram."""
-
-    found: Spectrogram
-    span: tuple[float, float]
-    name: str
-    is_fine: bool
-
-    def __call__(self, axes: Axes) -> None:
-        found, (low, high) = self.found, self.found.range_db
-        height = np.log10(found.frequency)
-        axes.pcolormesh(
-            found.times,
-            height,
-            found.level_db.T,
-            cmap="viridis",
-            vmin=low,
-            vmax=high,
-            rasterized=self.is_fine,
-        )
-        axes.grid(visible=False)
-        title = f"{self.name}, {low:.0f} to {high:.0f} dB".replace("-", "−")
-        axes.set(title=title, ylim=(height[0], height[-1]), ylabel="Hz")
-        decades = range(math.ceil(height[0]), math.floor(height[-1]) + 1)
-        axes.yaxis.set_ticks(decades, [f"{10.0**each:g}" for each in decades])
-        _time_axis(axes, self.span, TICKS // 2)
+def _draw_spectrum(
+    found: Spectrogram, span: tuple[float, float], name: str, axes: Axes, *, is_fine: bool
+) -> None:
+    low, high = found.range_db
+    height = np.log10(found.frequency)
+    mesh = partial(axes.pcolormesh, cmap="viridis", vmin=low, vmax=high, rasterized=is_fine)
+    mesh(found.times, height, found.level_db.T)
+    axes.grid(visible=False)
+    title = f"{name}, {low:.0f} to {high:.0f} dB".replace("-", "−")
+    axes.set(title=title, ylim=(height[0], height[-1]), ylabel="Hz")
+    decades = range(math.ceil(height[0]), math.floor(height[-1]) + 1)
+    axes.yaxis.set_ticks(decades, [f"{10.0**each:g}" for each in decades])
+    _time_axis(axes, span, TICKS // 2)
