@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 MARKERS = "o*xDs^"
 LINEAR_BELOW = 0.01
 """Bias axes are linear to this value, logarithmic above."""
+_BARS: Any = {"ms": 5, "fillstyle": "none", "lw": 0.8, "capsize": 2}
 WIDTH, HEIGHT = 5.2, 3.6
 """Of one pair of axes, in inches."""
 
@@ -96,15 +98,5 @@ def _draw_series(series: Series, axes: Axes, number: int) -> None:
     ).T
     colour = f"C{number}"
     axes.plot(x, theory, color=colour, lw=1.0)
-    axes.errorbar(
-        x,
-        measured,
-        yerr=2 * error,
-        fmt=MARKERS[number % len(MARKERS)],
-        color=colour,
-        ms=5,
-        fillstyle="none",
-        lw=0.8,
-        capsize=2,
-        label=series.title,
-    )
+    bars = partial(axes.errorbar, fmt=MARKERS[number % len(MARKERS)], color=colour, **_BARS)
+    bars(x, measured, yerr=2 * error, label=series.title)

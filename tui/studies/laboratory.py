@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,7 +18,6 @@ from estimator.levels.bands import bin_correlation
 from estimator.likelihood.dimension import choose_dimension
 from estimator.likelihood.multi_part import multi_part
 from estimator.methods import self_noise
-from estimator.self_noise.bias import three_channel_bias, three_sensor_bias
 from estimator.spectra.parts import PartEnds, Parts, part_bins
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
@@ -24,6 +25,7 @@ from estimator.types import ComplexArray, FloatArray
 from sim_devices.world import paper_scenarios
 from sim_devices.world.scenario import Scenario
 from sim_devices.world.world import World
+from tui.studies.numerical import BIAS, BIAS_LABEL
 from tui.studies.study import Panel, Point, ProgressCallback, Series, Study, StudyCurve
 
 HANN = WelchSettings(
@@ -41,8 +43,6 @@ FINE = 8
 REACH = 3
 """Bins to each side from which a Hann window takes power."""
 PSD_LABEL, FREQUENCY_LABEL = "PSD ((m/s²)²/Hz)", "frequency (Hz)"
-BIAS_LABEL = "fractional bias (1)"
-BIAS = {"three-channel": three_channel_bias, "three-sensor": three_sensor_bias}
 STYLES = {
     "three-channel": "k-",
     "three-sensor": "C0-",
@@ -76,23 +76,19 @@ class MeasuredSpectra:
         )
 
 
-class LaboratoryStudy:
-    """The set-ups' cross-spectral matrices, simulated when first wanted."""
+Laboratory: TypeAlias = Callable[[str], MeasuredSpectra]
+"""Returns what the sensors of a set-up read."""
 
-    def __init__(self, progress: ProgressCallback, *, length: float = 1.0) -> None:
-        self._progress = progress
-        self._duration = DURATION * length
-        self._measured: dict[str, MeasuredSpectra] = {}
 
-    def measured(self, name: str) -> MeasuredSpectra:
-        """Simulate a named scenario at the paper's length, and transform what its sensors read."""
-        if name not in self._measured:
-            self._measured[name] = measure(
-                paper_scenarios.named(name),
-                duration=self._duration,
-                progress=lambda share: self._progress(f"{name}: triaxial sensors", share),
-            )
-        return self._measured[name]
+def laboratory(progress: ProgressCallback, *, length: float = 1.0) -> Laboratory:
+    """Return what simulates a named scenario, once, and transforms what its sensors read."""
+
+    @cache
+    def measured(name: str) -> MeasuredSpectra:
+        told = partial(progress, f"{name}: triaxial sensors")
+        return measure(paper_scenarios.named(name), duration=DURATION * length, progress=told)
+
+    return measured
 
 
 def measure(
@@ -281,10 +277,10 @@ def _biases(title: str, *series: Series) -> Panel:
     return Panel(title, FREQUENCY_LABEL, BIAS_LABEL, series=series, log="x")
 
 
-def case(laboratory: LaboratoryStudy, number: str) -> tuple[Panel, Panel]:
+def case(measured_of: Laboratory, number: str) -> tuple[Panel, Panel]:
     """Spectra of one case of Table 1, and the bias of both methods by band."""
     setup, sensors = paper_scenarios.CASES[number]
-    measured = laboratory.measured(setup)
+    measured = measured_of(setup)
     noises = tuple(
         estimate(measured, sensors, method) for method in ("three-channel", "three-sensor")
     )
@@ -295,23 +291,23 @@ def case(laboratory: LaboratoryStudy, number: str) -> tuple[Panel, Panel]:
     )
 
 
-def setup1(laboratory: LaboratoryStudy) -> Study:
+def setup1(measured_of: Laboratory) -> Study:
     """Cases 0, 1 and 2 of Table 1 (Figs. 7 and 10, a to c)."""
-    panels = tuple(panel for number in "012" for panel in case(laboratory, number))
+    panels = tuple(panel for number in "012" for panel in case(measured_of, number))
     return Study("setup1", "Set-up 1: A and B turned by 60°", panels)
 
 
-def setup2(laboratory: LaboratoryStudy) -> Study:
+def setup2(measured_of: Laboratory) -> Study:
     """Case 3 of Table 1 (Figs. 7d and 10d)."""
-    return Study("setup2", "Set-up 2: A, B and E all turned", case(laboratory, "3"))
+    return Study("setup2", "Set-up 2: A, B and E all turned", case(measured_of, "3"))
 
 
-def fig14(laboratory: LaboratoryStudy) -> Study:
+def fig14(measured_of: Laboratory) -> Study:
     """Wider triangles, where coherence fails, and the estimate of all five sensors.
 
     The benchmark is that of the paper: the estimate of case 0.
     """
-    measured = laboratory.measured("setup1")
+    measured = measured_of("setup1")
     benchmark = estimate(measured, paper_scenarios.CASES["0"][1], "three-sensor")
     record = _record(measured, "E")
     panels: list[Panel] = []
@@ -331,9 +327,9 @@ def fig14(laboratory: LaboratoryStudy) -> Study:
     return Study("fig14", "Wider triangles are less coherent; five sensors know", tuple(panels))
 
 
-def waves(laboratory: LaboratoryStudy) -> Study:
+def waves(measured_of: Laboratory) -> Study:
     """Five sensors of any direction where the motion is far from coherent: beyond the paper."""
-    measured = laboratory.measured("waves")
+    measured = measured_of("waves")
     triangle = estimate(measured, ("E", "C", "D"), "three-sensor", n_channels=3)
     five = estimate_any_dimension(measured, n_channels=15)
     return Study(
@@ -350,9 +346,9 @@ def waves(laboratory: LaboratoryStudy) -> Study:
     )
 
 
-def two(laboratory: LaboratoryStudy) -> Study:
+def two(measured_of: Laboratory) -> Study:
     """Two sensors in motion whose level changes: beyond the paper."""
-    measured = laboratory.measured("two")
+    measured = measured_of("two")
     correlation = bin_correlation(get_window(HANN.window, HANN.segment_length), HANN.hop)
     frequency = HANN.frequencies[measured.parts.bins]
     found = multi_part(
@@ -379,7 +375,7 @@ def _goal(high: float) -> float:
     return 0.05 if high <= 20 else 0.2
 
 
-LABORATORY: Mapping[str, Callable[[LaboratoryStudy], Study]] = {
+LABORATORY: Mapping[str, Callable[[Laboratory], Study]] = {
     "setup1": setup1,
     "setup2": setup2,
     "fig14": fig14,

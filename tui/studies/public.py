@@ -134,23 +134,12 @@ def levels(test: str, result: Result) -> Iterator[Level]:
                 if each.scatter is not None
             ]
         for method, row in rows.items():
-            for column, (label, (value, least, most)) in enumerate(
-                zip(snapshot.channels, row, strict=True)
-            ):
-                yield Level(
-                    test=test,
-                    sensor=label.sensor,
-                    channel=label.channel,
-                    unit=label.unit,
-                    low_hz=low,
-                    high_hz=high,
-                    method=method,
-                    data=_db(data[column]),
-                    noise=_db(value),
-                    low=_db(least),
-                    high=_db(most),
-                    contradicts=method != BOUND and bool(least > upper[column]),
-                )
+            channels = zip(snapshot.channels, data, row, upper, strict=True)
+            for label, samples, (value, least, most), bound_above in channels:
+                own = (test, label.sensor, label.channel, label.unit, low, high, method)
+                numbers = map(_db, (samples, value, least, most))
+                is_above = method != BOUND and bool(least > bound_above)
+                yield Level(*own, *numbers, contradicts=is_above)
 
 
 def _db(psd: float) -> float:

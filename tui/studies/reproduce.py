@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -15,7 +16,7 @@ from sim_devices.errors import ScenarioError
 from tui.output.console import check_places, for_people, progress, write_json
 from tui.output.extras import require
 from tui.page.table import Cell, Table
-from tui.studies.laboratory import LABORATORY, LaboratoryStudy
+from tui.studies.laboratory import LABORATORY, laboratory
 from tui.studies.numerical import NUMERICAL, Ingredients
 from tui.studies.study import TOLERANCE, ProgressCallback, Series, Study
 
@@ -35,9 +36,9 @@ DEFAULT_FOLDER = Path("reproduced")
 def paper(progress: ProgressCallback, length: float) -> Mapping[str, Callable[[], Study]]:
     """Return the studies of the paper by name; they share what they simulate."""
     ingredients = Ingredients(progress, length=length)
-    laboratory = LaboratoryStudy(progress, length=length)
+    measured = laboratory(progress, length=length)
     return {name: partial(study, ingredients) for name, study in NUMERICAL.items()} | {
-        name: partial(study, laboratory) for name, study in LABORATORY.items()
+        name: partial(study, measured) for name, study in LABORATORY.items()
     }
 
 
@@ -110,7 +111,7 @@ def run(
     started = time.monotonic()
     done: list[Study] = []
     files: list[Path] = []
-    with _Progress() as report:
+    with _progress() as report:
         wanted = reproduce(names, progress=report, length=length, studies=studies)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -141,31 +142,19 @@ def run(
     return agrees
 
 
-class _Progress:
-    """A bar for what is being simulated, with the time left."""
+@contextmanager
+def _progress() -> Iterator[ProgressCallback]:
+    """Show a bar for what is being simulated, with the time left."""
+    left = TimeRemainingColumn(), TextColumn("left,"), TimeElapsedColumn()
+    with progress(*Progress.get_default_columns()[:-1], *left) as bar:
+        task = bar.add_task("", total=1.0)
 
-    def __init__(self) -> None:
-        self._bar = progress(
-            *Progress.get_default_columns()[:-1],
-            TimeRemainingColumn(),
-            TextColumn("left,"),
-            TimeElapsedColumn(),
-        )
-        self._task = self._bar.add_task("", total=1.0)
-        self._what = ""
+        def report(what: str, share: float) -> None:
+            if what != bar.tasks[0].description:
+                bar.reset(task, description=what, total=1.0)
+            bar.update(task, completed=share)
 
-    def __enter__(self) -> ProgressCallback:
-        self._bar.start()
-        return self._report
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def _report(self, what: str, share: float) -> None:
-        if what != self._what:
-            self._what = what
-            self._bar.reset(self._task, description=what, total=1.0)
-        self._bar.update(self._task, completed=share)
+        yield report
 
 
 def _print(console: Console, studies: list[Study], folder: Path, elapsed: float) -> None:
