@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daq.archive.stations import Run
-    from daq.archive.waveforms import FileReading, FoundFiles
-    from daq.formats.sources import Selection
+    from daq.archive.waveforms import FileReading
+    from daq.formats.assembly import Overlap
 
 
 @command(first="store stretch jobs out band segment response channels json csv")
@@ -118,6 +118,7 @@ def archive(
     from daq.bench.masks.mask_file import masks_named
     from daq.estimation.settings import Settings
     from tui.commands.archive_answers import Asked, watched
+    from tui.commands.import_ import selected
     from tui.runs.archives import Filling
     from tui.runs.estimate_settings import chosen, settings_for
 
@@ -161,19 +162,21 @@ def archive(
         stretch,
         asked.run,
         asked.checked,
-        refuse=partial(_nothing, folder),
+        refuse=typer.BadParameter,
+        asked="codes and times; check the folder, --start and --end",
+        grouped=". If they are of several stations, say so: --group 'LAB=XX.TST?.*'",
         say=partial(notices().print, soft_wrap=True),
         watched=watched,
     )
     if are_waveforms(sources):
-        selection, reading = _reading(
-            channels=channels,
-            codes=(net, sta, loc),
-            span=(start, end),
-            file_overlap=file_overlap,
-            response=response,
-            response_for=response_for,
+        if file_overlap not in {"refuse", "first", "last"}:
+            expected = "expected refuse, first or last"
+            raise typer.BadParameter(f"--file-overlap {file_overlap}: {expected}")
+        codes, wanted_channels = (net, sta, loc), channels or []
+        selection = selected(
+            channels=wanted_channels, start=start, end=end, overlap=file_overlap, codes=codes
         )
+        reading = _reading(response or [], response_for or [], selection.overlap)
         settings, groups = chosen(Settings(), **wanted), [_group(text) for text in group or []]
         with notices().status("looking for files"):
             found = filling.look(sources, selection, settings, groups)
@@ -218,29 +221,17 @@ def _runner(jobs: int, scheduler: str | None) -> Run:
 
 
 def _reading(
-    *,
-    channels: Sequence[str] | None,
-    codes: tuple[str, str, str],
-    span: tuple[str | None, str | None],
-    file_overlap: str,
-    response: Sequence[Path] | None,
-    response_for: Sequence[str] | None,
-) -> tuple[Selection, FileReading]:
-    """Return which days and channels are wanted, and how they are read."""
-    from tui.commands.import_ import assigned, selected
+    responses: Sequence[Path], response_for: Sequence[str], overlap: Overlap
+) -> FileReading:
+    """Return how files are read."""
+    from tui.commands.import_ import assigned
     from tui.runs.archives import reading_of
 
-    if file_overlap not in {"refuse", "first", "last"}:
-        raise typer.BadParameter(f"--file-overlap {file_overlap}: expected refuse, first or last")
-    selection = selected(
-        channels=channels or [], start=span[0], end=span[1], overlap=file_overlap, codes=codes
-    )
-    pairs = [assigned(text) for text in response_for or []]
-    responses = response or []
+    pairs = [assigned(text) for text in response_for]
     for path in [*responses, *(path for _, path in pairs)]:
         if not path.exists():
             raise typer.BadParameter(f"--response {path}: no such file or folder")
-    return selection, reading_of(responses, pairs, selection.overlap)
+    return reading_of(responses, pairs, overlap)
 
 
 def _group(text: str) -> tuple[str, str]:
@@ -249,18 +240,3 @@ def _group(text: str) -> tuple[str, str]:
     if not equals or not pattern or not all(c.isalnum() or c in "._-" for c in name.strip(".")):
         raise typer.BadParameter(f"--group {text}: expected NAME=PATTERN, as in 'LAB=XX.TST?.*'")
     return name, pattern
-
-
-def _nothing(folder: Path, found: FoundFiles | None) -> typer.BadParameter:
-    """Return the error where there is nothing to take."""
-    text = "no miniSEED files found for these codes and times; check the folder, --start and --end"
-    if found is None:
-        text = f"{folder}: no archive there; give recordings to begin one"
-    elif found.problems:
-        text = "\n".join(found.problems)
-    elif found.alone:
-        text = (
-            f"one sensor each: {' '.join(found.alone)}; expected two or more that stand together."
-            " If they are of several stations, say so: --group 'LAB=XX.TST?.*'"
-        )
-    return typer.BadParameter(text)

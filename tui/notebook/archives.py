@@ -16,7 +16,7 @@ from daq.archive.execution import carried_out
 from daq.archive.plan import STRETCHES
 from daq.archive.sources import are_waveforms, folder_for
 from daq.archive.store import Store
-from daq.archive.waveforms import FileReading, FoundFiles
+from daq.archive.waveforms import FileReading
 from daq.errors import ArchiveError, WrongSettingError
 from daq.estimation.settings import Settings, check_fit
 from daq.formats.assembly import Overlap
@@ -185,7 +185,9 @@ def archive(
         stretch,
         partial(carried_out, jobs=jobs),
         lambda plan: plan.changed(wanted, stretch),
-        refuse=partial(_nothing, folder),
+        refuse=ArchiveError,
+        asked="channels and times",
+        grouped=": groups= joins those of several stations",
     )
     if are_waveforms(given):
         selection = Selection(
@@ -236,21 +238,6 @@ def _reading(response: object, overlap: Overlap) -> FileReading:
                 " days read the file"
             )
     return reading_of(some, assigned, overlap)
-
-
-def _nothing(folder: Path, found: FoundFiles | None) -> ArchiveError:
-    """Return the error where there is nothing to take."""
-    text = "no miniSEED files found for these channels and times"
-    if found is None:
-        text = f"{folder}: no archive there; give recordings to begin one"
-    elif found.problems:
-        text = "\n".join(found.problems)
-    elif found.alone:
-        text = (
-            f"one sensor each: {' '.join(found.alone)}; expected two or more that stand"
-            " together: groups= joins those of several stations"
-        )
-    return ArchiveError(text)
 
 
 def _settings_for(path: Path, options: EstimateOptions) -> Settings:

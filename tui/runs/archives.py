@@ -42,7 +42,9 @@ class Filling:
     check : callable
         Raises if the options do not fit the plan of an archive.
     refuse : callable
-        Returns the error if there is nothing to take; of waveform files, with what was found.
+        Makes an error of a text, if there is nothing to take.
+    asked, grouped : str
+        In its text: by what waveform files are looked for, and how stations are joined.
     say : callable
         Takes sentences on what is taken.
     watched : callable
@@ -53,7 +55,9 @@ class Filling:
     stretch: str | None
     run: stations.Run
     check: Callable[[Plan], object]
-    refuse: Callable[[FoundFiles | None], Exception]
+    refuse: Callable[[str], Exception]
+    asked: str
+    grouped: str
     say: Callable[[str], object] = lambda _: None
     watched: Callable[[Iterable[Outcome], Mapping[str, int], str], Iterable[Outcome]] = (
         lambda outcomes, *_: outcomes
@@ -68,7 +72,7 @@ class Filling:
             inside = map(Store.open, stations.archives_in(self.folder))
             found = {each.folder.name: each for each in inside if each}
             if not found:
-                raise self.refuse(None)
+                raise self.refuse(f"{self.folder}: no archive there; give recordings to begin one")
             return found, []
         if archive is None:
             archive = execution.begun(self.folder, paths, self.stretch, settings_for, self.check)
@@ -113,7 +117,15 @@ class Filling:
         known, segment = Contents(self.folder), settings.segment
         found = stations_in(sources, selection, groups=groups, known=known, segment=segment)
         if not found.stations:
-            raise self.refuse(found)
+            text = f"no miniSEED files found for these {self.asked}"
+            if found.problems:
+                text = "\n".join(found.problems)
+            elif found.alone:
+                text = (
+                    f"one sensor each: {' '.join(found.alone)}; expected two or more that stand"
+                    f" together{self.grouped}"
+                )
+            raise self.refuse(text)
         return found, known
 
     def by_days(
