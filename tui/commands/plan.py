@@ -81,16 +81,6 @@ def plan(
             "snr": snr,
             "cov": cov,
             "waves": None if planned.waves is None else asdict(planned.waves),
-            "methods": [
-                {
-                    "method": entry.method,
-                    "duration": entry.duration,
-                    "segments": entry.n_segments,
-                    "bias": entry.bias.tolist(),
-                    "efficiency": entry.efficiency.tolist(),
-                    "weak": entry.is_motion_weak,
-                }
-                for entry in planned.values()
-            ],
+            "methods": list(planned.values()),
         },
     )

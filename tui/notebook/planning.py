@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -180,10 +180,10 @@ class MethodPlan:
 
     method: str
     duration: float
-    n_segments: float
+    n_segments: float = field(metadata={"key": "segments"})
     bias: FloatArray
     efficiency: FloatArray
-    is_motion_weak: bool
+    is_motion_weak: bool = field(metadata={"key": "weak"})
 
     @classmethod
     def of(cls, entry: TimePlan) -> MethodPlan:

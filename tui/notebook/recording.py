@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from abc import abstractmethod
+from bisect import bisect_left
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -199,14 +200,8 @@ class _Clock:
 
     def sample_at(self, utc_ns: int, end_sample: int) -> int:
         """Return the first sample that is not before a time, at most `end_sample`."""
-        low, high = 0, end_sample
-        while low < high:
-            middle = (low + high) // 2
-            if self.times(np.array([middle]))[0] < utc_ns:
-                low = middle + 1
-            else:
-                high = middle
-        return low
+        every = range(end_sample)
+        return bisect_left(every, utc_ns, key=lambda at: self.times(np.array([at]))[0])
 
 
 class RecordingFile(SampledSensors):

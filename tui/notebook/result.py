@@ -304,17 +304,9 @@ class Result:
         """Return one channel, by sensor and channel: ``result["A", "X"]``."""
         for column, each in enumerate(self.channels):
             if (each.sensor, each.channel) == label:
-                return ChannelNoise(
-                    each.sensor,
-                    each.channel,
-                    each.unit,
-                    self.frequency,
-                    self.data_psd[:, column],
-                    self.noise_psd[:, column],
-                    self.noise_low[:, column],
-                    self.noise_high[:, column],
-                    self.cov[:, column],
-                )
+                noise = self.noise_psd, self.noise_low, self.noise_high, self.cov
+                own = (values[:, column] for values in (self.data_psd, *noise))
+                return ChannelNoise(*label, each.unit, self.frequency, *own)
         known = ", ".join(f'"{each.sensor}", "{each.channel}"' for each in self.channels)
         raise KeyError(f"{label!r}: expected a sensor and a channel, one of: {known}")
 
@@ -404,8 +396,6 @@ class Result:
         width : float
             Of the figure, in inches.
         """
-        from tui.notebook.result import draw, figure  # noqa: PLC0415 - loads matplotlib
-
         masks = masks_named(models if isinstance(models, str) else ",".join(models))
         for mask in masks:
             mask.check_unit(self.unit)
