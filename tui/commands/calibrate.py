@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import estimated
-from tui.commands.options import command, with_estimate_options
+from tui.commands.options import command, with_spanned_options
 from tui.output.console import check_places, for_people, hint, write_json
 
 if TYPE_CHECKING:
@@ -23,14 +23,12 @@ _GAP = 2
 
 
 @command()
-@with_estimate_options
+@with_spanned_options
 def calibrate(
     files: list[Path],
     *,
     reference: str | None = None,
     confidence: float = 0.95,
-    start: str | None = None,
-    end: str | None = None,
     json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -63,7 +61,7 @@ def calibrate(
     from tui.output.json_document import calibration_document
 
     check_places(json)
-    result = estimated(files, start=start, end=end, whole=True, **wanted)
+    result = estimated(files, whole=True, **wanted)
     snapshot = result.snapshot
     found = calibrate(result, result.bench, reference=reference, confidence=confidence)
     screen = for_people(json)

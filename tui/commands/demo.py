@@ -11,7 +11,7 @@ import tempfile
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -25,7 +25,6 @@ from tui.page.table import Cell, Table
 
 if TYPE_CHECKING:
     from daq.estimation.settings import Settings
-    from daq.estimation.snapshot import Snapshot
     from daq.results.result import Result
     from sim_devices.world.scenario import Scenario
 
@@ -97,7 +96,9 @@ def demo(
             path.write_text(dump(reachable), encoding="utf-8")
             settings = replace(Settings.of(reachable), methods=METHODS[::-1])
             if on_screen:
-                out = _show(path, settings)
+                from tui.commands.tui import show_demo
+
+                out = show_demo(path, settings)
             else:
                 out = path.with_suffix(".h5")
                 interrupted = _record(path, out, settings, bench.recording.duration or 60.0, speed)
@@ -125,7 +126,11 @@ def demo(
     screen.print(comparison_table(compared, result))
     for line in verdict(compared):
         screen.print(line)
-    write_json(json, _document(compared, snapshot))
+    channels = [
+        asdict(entry) | {"covers": entry.covers, "withdrawn": entry.withdrawn} for entry in compared
+    ]
+    about = {"segments": snapshot.n_segments, "unit": snapshot.unit, "channels": channels}
+    write_json(json, about)
     if interrupted:
         raise typer.Exit(ExitCode.INTERRUPTED)
 
@@ -154,12 +159,6 @@ class NoiseComparison:
         """Whether the truth lies in the interval of an estimate that is not withdrawn."""
         is_inside = self.noise_psd_low <= self.true_noise_psd <= self.noise_psd_high
         return is_inside and not self.withdrawn
-
-
-def _show(path: Path, settings: Settings) -> Path | None:
-    from tui.commands.tui import show_demo
-
-    return show_demo(path, settings)
 
 
 def _record(path: Path, out: Path, settings: Settings, duration: float, speed: float) -> bool:
@@ -200,18 +199,10 @@ def compare(result: Result, scenario: Scenario) -> list[NoiseComparison]:
             place = places.get(label.sensor, 0)
             places[label.sensor] = place + 1
             truth = scenario.true_noise_psd(label.sensor, place, inside)
-            compared.append(
-                NoiseComparison(
-                    sensor=label.sensor,
-                    channel=label.channel,
-                    method=method,
-                    true_noise_psd=float(truth.mean()),
-                    noise_psd=float(mean.mean[0]),
-                    noise_psd_low=float(mean.low[0]),
-                    noise_psd_high=float(mean.high[0]),
-                    added_by_clocks=float(sum(each[column] for each in clocks)),
-                )
-            )
+            numbers = (truth.mean(), mean.mean[0], mean.low[0], mean.high[0])
+            added = sum(each[column] for each in clocks)
+            own = (label.sensor, label.channel, method)
+            compared.append(NoiseComparison(*own, *map(float, (*numbers, added))))
     return compared
 
 
@@ -275,14 +266,3 @@ def verdict(compared: list[NoiseComparison]) -> list[str]:
             "the channel. The noise is below that, whatever the motion."
         )
     return lines
-
-
-def _document(compared: list[NoiseComparison], snapshot: Snapshot) -> dict[str, Any]:
-    return {
-        "segments": snapshot.n_segments,
-        "unit": snapshot.unit,
-        "channels": [
-            {**asdict(entry), "covers": entry.covers, "withdrawn": entry.withdrawn}
-            for entry in compared
-        ],
-    }

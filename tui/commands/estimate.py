@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daq.foreign_files import import_command, is_foreign
-from estimator.records import dataclass
-from tui.commands.options import DetailsOption, command, with_estimate_options
+from tui.commands.options import DetailsOption, command, with_spanned_options
 from tui.output.console import (
     STANDARD_OUTPUT,
     check_places,
@@ -25,7 +24,7 @@ from tui.output.console import (
 from tui.output.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rich.console import Console, RenderableType
 
@@ -35,12 +34,10 @@ if TYPE_CHECKING:
 
 
 @command(first="methods segment band unit response start end diagnostics json csv")
-@with_estimate_options
+@with_spanned_options
 def estimate(
     files: list[Path],
     *,
-    start: str | None = None,
-    end: str | None = None,
     diagnostics: DetailsOption = False,
     noise_parameters: bool = False,
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1)] = 1,
@@ -89,15 +86,14 @@ def estimate(
     """
     check_places(json, csv)
     if any(map(is_foreign, files)):
-        result = _of_foreign_files(
-            files,
-            _Foreign(tuple(response or ()), tuple(response_for or ()), tuple(channels or ())),
-            json=json or csv,
-            jobs=jobs,
-            start=start,
-            end=end,
-            **wanted,
-        )
+        from tui.commands.import_ import assigned, selected
+
+        asked = {
+            "response": response or (),
+            "response_for": [assigned(text) for text in response_for or ()],
+            "selection": selected(channels=channels or ()),
+        }
+        result = _of_foreign_files(files, asked, json=json or csv, jobs=jobs, **wanted)
         hint(f"For a recording and reports: {import_command(files)}")
     elif response or response_for or channels:
         raise typer.BadParameter(
@@ -105,7 +101,7 @@ def estimate(
             " --response-for and --channels with files of other programs"
         )
     else:
-        result = estimated(files, start=start, end=end, whole=noise_parameters, jobs=jobs, **wanted)
+        result = estimated(files, whole=noise_parameters, jobs=jobs, **wanted)
         hint(f"For a report: huddle report {files[0]}")
     parameters = None
     if noise_parameters:
@@ -134,18 +130,9 @@ def exit_with(found: TestVerdict | None) -> None:
         raise typer.Exit(ExitCode.NOT_DECIDED)
 
 
-@dataclass(frozen=True, slots=True)
-class _Foreign:
-    """What is taken from files of other programs."""
-
-    response: tuple[Path, ...]
-    response_for: tuple[str, ...]
-    channels: tuple[str, ...]
-
-
 def _of_foreign_files(
     files: Sequence[Path],
-    taken: _Foreign,
+    asked: Mapping[str, Any],
     *,
     json: str | None,
     jobs: int,
@@ -161,19 +148,13 @@ def _of_foreign_files(
     from daq.formats.defaults import from_files, still_chosen
     from daq.formats.importer import open_files
     from daq.results.result import Result
-    from tui.commands.import_ import assigned, selected, show_chosen, show_taken
+    from tui.commands.import_ import show_chosen, show_taken
     from tui.runs.estimate_settings import check_fit, chosen_for_files, spanned
 
     screen = for_people(json)
     with TemporaryDirectory(prefix="huddle-") as folder, counted("segments", waits=True) as count:
         try:
-            recording, imported = open_files(
-                files,
-                Path(folder),
-                response=taken.response,
-                response_for=[assigned(text) for text in taken.response_for],
-                selection=selected(channels=taken.channels),
-            )
+            recording, imported = open_files(files, Path(folder), **asked)
         except ImportFormatError as error:
             more = f"for options of such files: {import_command(files)}"
             raise ImportFormatError(f"{error}\n{more}") from None

@@ -11,20 +11,18 @@ from typing import Annotated, Any
 import typer
 
 from tui.commands.estimate import estimated
-from tui.commands.options import OutOption, command, with_estimate_options, with_logging
+from tui.commands.options import OutOption, command, with_logging, with_spanned_options
 from tui.output.console import for_people, write_json
 
 
 @command()
 @with_logging
-@with_estimate_options
+@with_spanned_options
 def export(
     files: list[Path],
     *,
     kind: Annotated[str, typer.Option("--format")],
     out: OutOption = None,
-    start: str | None = None,
-    end: str | None = None,
     json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -58,8 +56,7 @@ def export(
     from tui.output.json_document import provenance
 
     if kind == MINISEED:
-        given = [start, end, *wanted.values()]
-        if len(files) > 1 or any(value is not None for value in given):
+        if len(files) > 1 or any(value is not None for value in wanted.values()):
             raise typer.BadParameter(
                 "mseed holds all samples of one recording; expected one FILE and no options of the"
                 " estimate"
@@ -70,7 +67,7 @@ def export(
         known = ", ".join((MINISEED, *WRITERS))
         raise typer.BadParameter(f"--format {kind}: expected one of {known}")
     path = out or files[0].with_suffix(WRITERS[kind][0])
-    result = estimated(files, start=start, end=end, **wanted)
+    result = estimated(files, **wanted)
     snapshot = result.snapshot
     write_curves(snapshot, kind, path, provenance(result))
     n_curves = len(snapshot.results) * len(snapshot.channels)

@@ -123,30 +123,38 @@ def import_(
     chosen for the estimate: segment 16m40s (lower corner 120 s); unit m/s²
     lab.h5 written; next: huddle estimate lab.h5
     """
-    segments = None if overlap in {None, "refuse", "first", "last"} else overlap
-    import_recording(
+    from daq.bench.loading import parse
+    from daq.formats.importer import import_files
+    from tui.runs.estimate_settings import chosen_for_files
+
+    if overlap not in {None, "refuse", "first", "last"}:
+        wanted["overlap"], overlap = read_option("overlap", overlap), None
+    rates = sampling_rates or []
+    of_sensors = [each for each in rates if "=" in each]
+    wanted["sampling_rates"] = read_option("sampling_rates", of_sensors)
+    given = any(value is not None for value in wanted.values())
+    result = import_files(
         sources,
-        out=out,
-        bench=bench,
+        out,
+        bench=None if bench is None else parse(bench.read_text(encoding="utf-8"), bench),
+        estimate=partial(chosen_for_files, **wanted) if given else None,
         response=response or [],
-        response_for=response_for or [],
-        sampling_rate=_rate([each for each in sampling_rates or [] if "=" not in each]),
+        response_for=[assigned(text) for text in response_for or []],
+        sampling_rate=_rate([each for each in rates if each not in of_sensors]),
         selection=selected(
             channels=channels or [],
             start=start,
             end=end,
-            overlap=overlap if segments is None else None,
+            overlap=overlap,
             codes=(net, sta, loc),
             columns=columns,
             unit=sample_unit,
         ),
-        json=json,
-        overlap=read_option("overlap", segments),
-        sampling_rates=read_option(
-            "sampling_rates", [each for each in sampling_rates or [] if "=" in each]
-        ),
-        **wanted,
     )
+    _show(result, out, json)
+    write_json(json, {"recording": str(out), **asdict(result)})
+    if result.problems:
+        raise typer.Exit(ExitCode.TROUBLE)
 
 
 def selected(
@@ -197,49 +205,6 @@ def _instant_ns(flag: str, text: str | None) -> int | None:
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
-
-
-def import_recording(
-    sources: Sequence[str | Path],
-    *,
-    out: Path,
-    bench: Path | None,
-    response: Sequence[Path] = (),
-    response_for: Sequence[str] = (),
-    sampling_rate: float | None,
-    selection: Selection | None = None,
-    json: str | None,
-    **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
-) -> None:
-    """Write a recording from files of other programs, and show what it holds.
-
-    Options of the estimate become part of the bench file in the recording.
-
-    Raises
-    ------
-    typer.Exit
-        With the code of trouble, if a file or channel could not be used.
-    """
-    from daq.bench.loading import parse
-    from daq.formats.importer import import_files
-    from tui.runs.estimate_settings import chosen_for_files
-
-    described = None if bench is None else parse(bench.read_text(encoding="utf-8"), bench)
-    given = any(value is not None for value in wanted.values())
-    result = import_files(
-        sources,
-        out,
-        bench=described,
-        estimate=partial(chosen_for_files, **wanted) if given else None,
-        response=response,
-        response_for=[assigned(text) for text in response_for],
-        sampling_rate=sampling_rate,
-        selection=selection,
-    )
-    _show(result, out, json)
-    write_json(json, {"recording": str(out), **asdict(result)})
-    if result.problems:
-        raise typer.Exit(ExitCode.TROUBLE)
 
 
 def _rate(given: Sequence[str]) -> float | None:

@@ -61,30 +61,24 @@ def init(
     """
     if port and not discover:
         raise typer.BadParameter("--port needs --discover")
-    if discover:
-        write_discovered(out, port or (), force=force)
-    else:
-        write_template(out, force=force)
-
-
-def write_template(out: Path, *, force: bool) -> None:
-    """Write the commented bench file.
-
-    Raises
-    ------
-    typer.BadParameter
-        The file exists, or its folder does not.
-    """
     if out.exists() and not force:
         raise typer.BadParameter(f"{out}: exists already; --force replaces it")
     check_places(str(out))
+    if discover:
+        write_discovered(out, port or ())
+    else:
+        write_template(out)
+
+
+def write_template(out: Path) -> None:
+    """Write the commented bench file."""
     text = resources.files("tui.resources").joinpath("bench.toml").read_text(encoding="utf-8")
     write_text(str(out), text)
     console().print(f"{out} written. Fill in ports and sensitivities, then: huddle check {out}")
     print_others(text)
 
 
-def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
+def write_discovered(out: Path, ports: Sequence[str]) -> None:
     """Look for devices on ports, and write a commented bench file that reads them.
 
     On a terminal, operator, names, directions, limits, end and unit are asked for. Without
@@ -92,8 +86,6 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
 
     Raises
     ------
-    typer.BadParameter
-        The file exists, or its folder does not.
     NoAnswerError
         No port has a device that huddle can read.
     """
@@ -101,9 +93,6 @@ def write_discovered(out: Path, ports: Sequence[str], *, force: bool) -> None:
     from estimator.wording import listed, several
     from tui.runs.first_bench import answers_in, draft, with_device
 
-    if out.exists() and not force:
-        raise typer.BadParameter(f"{out}: exists already; --force replaces it")
-    check_places(str(out))
     is_asked = sys.stdin.isatty() and sys.stdout.isatty()
     searched, found = _search(ports, is_asked=is_asked)
     text = draft(out)

@@ -13,7 +13,7 @@ import typer
 
 from tui.certificate.ledger import Ledger, LedgerError, ledger_of, ledgers_of
 from tui.commands.estimate import estimated, exit_with
-from tui.commands.options import command, with_estimate_options
+from tui.commands.options import command, with_spanned_options
 from tui.commands.verify import known_to_services
 from tui.output.console import console, for_people, notices, write_json
 from tui.output.extras import require
@@ -21,7 +21,7 @@ from tui.page.table import Table
 
 
 @command(first="by reason bench folder allow_incomplete despite specimen sign start end")
-@with_estimate_options
+@with_spanned_options
 def issue(
     files: list[Path],
     *,
@@ -34,8 +34,6 @@ def issue(
     is_specimen: Annotated[bool, typer.Option("--specimen")] = False,
     sign: Path | None = None,
     models: str = "",
-    start: str | None = None,
-    end: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
     """Issue a numbered certificate of a huddle test as PDF.
@@ -111,7 +109,7 @@ def issue(
         )
     if not is_specimen:
         examined.check()
-    result = estimated(files, start=start, end=end, whole=True, **wanted)
+    result = estimated(files, whole=True, **wanted)
     with notices().status("making the certificate"):
         if is_specimen:
             place = files[0].absolute().parent if folder is None else folder

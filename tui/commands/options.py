@@ -253,8 +253,16 @@ def read_option(name: str, given: Any) -> object:  # noqa: ANN401 - text, texts,
         raise typer.BadParameter(f"{flag} {shown!r}: {error}") from None
 
 
-def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command all options of an estimate.
+_SPAN = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=str | None)
+    for name in ("start", "end")
+]
+
+
+def with_estimate_options(
+    command: Callable[..., None], *, has_span: bool = False
+) -> Callable[..., None]:
+    """Give a command all options of an estimate, and on request start and end of a time span.
 
     The command receives their values as ``**wanted``, by field of
     `daq.bench.estimate_settings.EstimateSettings`; None where an option is not given. A parameter
@@ -262,6 +270,7 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     """
     first, *others = inspect.signature(command, eval_str=True).parameters.values()
     own = [each for each in others if each.kind is not each.VAR_KEYWORD]
+    own += _SPAN if has_span else []
     added = [name for name in OPTIONS if name not in {each.name for each in own}]
 
     @wraps(command)
@@ -274,6 +283,8 @@ def with_estimate_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
+with_spanned_options = partial(with_estimate_options, has_span=True)
+"""Of a command that estimates recordings, or a part of them."""
 LogLevelOption: TypeAlias = Annotated[LogLevel, typer.Option(show_default=False)]
 LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option(show_default=False)]
 

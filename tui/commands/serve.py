@@ -155,19 +155,16 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
     for entry in bench.schedule.entries:
         found = entry.duration or entry.longest or bench.recording.duration
         key = f'schedule["{entry.name}"].duration'
+        wrong = ""
         if found is None:
-            faults.append(
-                FileFault(
-                    key,
-                    'is missing; expected one such as "3h", here or in'
-                    " [recording], or target_cov or until with longest",
-                )
+            wrong = (
+                'is missing; expected one such as "3h", here or in [recording], or target_cov or'
+                " until with longest"
             )
         elif found < shortest:
-            at_least = format_duration(shortest)
-            faults.append(
-                FileFault(key, f"too short for an estimate; expected at least {at_least}")
-            )
+            wrong = f"too short for an estimate; expected at least {format_duration(shortest)}"
+        if wrong:
+            faults.append(FileFault(key, wrong))
     if bench.metrics is not None:
         require("prometheus_client")
     if bench.web is not None:

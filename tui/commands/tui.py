@@ -8,7 +8,7 @@ import os
 import sys
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -21,6 +21,7 @@ from tui.output.console import check_places, notices
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from textual.app import App
     from textual.driver import Driver
 
     from daq.bench.masks.mask import Mask
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from daq.recording.interface import ReadableSensor
     from tui.application.app import HuddleApp
 
+Shown = TypeVar("Shown")
 BROWSER = "TEXTUAL_DRIVER"
 """Set by ``textual serve``: the application is shown in a browser, and needs no terminal."""
 
@@ -181,15 +183,11 @@ def first_bench(path: Path, ports: Sequence[str], baud: int | None = None) -> Pa
     from daq.transport.serial_ports import serial_ports
     from tui.application.first_bench import FirstBenchApp
     from tui.commands.tui_controls import ComputerControls
-    from tui.output.logs.lines import screen_taken
     from tui.runs.first_bench import draft
 
     check_places(str(path))
     searched = list(ports) or [each.path for each in serial_ports()]
-    app = FirstBenchApp(ComputerControls(path, searched, draft(path)), _driver(baud))
-    app.theme = _theme()
-    with screen_taken():
-        return app.run()
+    return _shown(FirstBenchApp(ComputerControls(path, searched, draft(path)), _driver(baud)))
 
 
 def _has_terminal() -> bool:
@@ -200,16 +198,12 @@ def _has_terminal() -> bool:
 
 def _run(app: HuddleApp, *, again: Path) -> None:
     """Run the application; print the name of its recording, and whether it continues."""
-    from tui.output.logs.lines import screen_taken
-
     if not _has_terminal():
         raise typer.BadParameter(
             "the application needs a terminal, for standard input, output and error; huddle watch"
             " RECORDING and huddle run BENCH need none"
         )
-    app.theme = _theme()
-    with screen_taken():
-        app.run()
+    _shown(app)
     if app.state.path is None:
         return
     if app.state.is_recording:
@@ -221,22 +215,25 @@ def _run(app: HuddleApp, *, again: Path) -> None:
         notices().print(f"Recording: {app.state.path}", soft_wrap=True)
 
 
-def _theme() -> str:
-    """Return the colour theme that HUDDLE_THEME names.
+def _shown(app: App[Shown]) -> Shown | None:
+    """Run an application in the colour theme that HUDDLE_THEME names; return its result.
 
     Raises
     ------
     typer.BadParameter
-        There is none of this name.
+        There is no theme of this name.
     """
     from tui.application.themes import THEMES, USUAL
+    from tui.output.logs.lines import screen_taken
 
     name = os.environ.get("HUDDLE_THEME", USUAL)
     if name not in THEMES:
         raise typer.BadParameter(
             f"HUDDLE_THEME = {name!r}: no such theme; expected {', '.join(THEMES)}"
         )
-    return name
+    app.theme = name
+    with screen_taken():
+        return app.run()
 
 
 def show_demo(path: Path, settings: Settings) -> Path | None:
@@ -250,15 +247,11 @@ def show_demo(path: Path, settings: Settings) -> Path | None:
     from daq.devices.bench_file import load
     from tui.application.app import HuddleApp
     from tui.commands.tui_controls import BenchControls
-    from tui.output.logs.lines import screen_taken
 
     # The recording of the demo is deleted when the demo ends; reports are kept.
     controls = BenchControls(path, load(path), settings, reports=Path.cwd())
     try:
-        with screen_taken():
-            app = HuddleApp(controls, start=True, driver=_driver())
-            app.theme = _theme()
-            app.run()
+        _shown(HuddleApp(controls, start=True, driver=_driver()))
         for recorder in controls.started:
             recorder.stop()
     finally:

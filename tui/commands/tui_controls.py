@@ -62,10 +62,8 @@ LATEST = 16
 
 def running_recording(bench: Bench) -> Path | None:
     """Return the newest recording of this bench whose recorder answers: the first of its parts."""
-    folder = bench.recording_directory
-    if not folder.is_dir():
-        return None
-    files = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
+    found = bench.recording_directory.glob("*.h5")
+    files = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
     return next((first_part(path) for path in files[:LATEST] if _runs(path, bench)), None)
 
 
@@ -110,9 +108,8 @@ def _part(path: Path) -> tuple[str, tuple[Path, str]]:
 def _runs(path: Path, bench: Bench) -> bool:
     try:
         with Recording.open(path) as recording:
-            if recording.closed:
-                return False
-        if not is_of(path, bench):
+            is_closed = recording.closed
+        if is_closed or not is_of(path, bench):
             return False
         ask(path, "status")
     except HuddleError:
@@ -136,11 +133,16 @@ class _Controls:
 
     def stop(self, path: Path) -> None:
         """Ask the recorder of a file to stop."""
+        self._check_own(path)
         ask(path, "stop")
 
     def mark(self, path: Path, text: str) -> None:
         """Ask the recorder of a file to record a remark."""
+        self._check_own(path)
         ask(path, "mark", text)
+
+    def _check_own(self, path: Path) -> None:
+        """Raise an error if a recording is not to be stopped or marked from here."""
 
     def announce(self, event: str, text: str, path: Path | None) -> None:
         """Start the command that the user gave for events."""
@@ -178,12 +180,8 @@ class _Controls:
         require("matplotlib", "jinja2", "fpdf", "pypdf")
         from tui.certificate import issuing  # noqa: PLC0415 - loads matplotlib
 
-        order = issuing.Order(
-            by=wanted["by"],
-            reason=wanted["reason"],
-            despite=wanted["despite"],
-            about=self.described(path),
-        )
+        own: dict[str, Any] = {key: wanted[key] for key in ("by", "reason", "despite")}
+        order = issuing.Order(about=self.described(path), **own)
         examined = issuing.examine([path], order, known=known_to_services)
         if order.by and examined.objections:
             raise HuddleError("\n".join(each.line for each in examined.objections))
@@ -275,16 +273,6 @@ class BenchControls(_Controls):
         if values:
             self.save_bench(with_values(self.read_bench(), values))
 
-    def stop(self, path: Path) -> None:
-        """Ask the recorder of a file of this bench to stop."""
-        self._check_own(path)
-        super().stop(path)
-
-    def mark(self, path: Path, text: str) -> None:
-        """Ask the recorder of a file of this bench to record a remark."""
-        self._check_own(path)
-        super().mark(path, text)
-
     def _check_own(self, path: Path) -> None:
         """Raise an error if a recording is another bench's: it is only shown here.
 
@@ -294,14 +282,12 @@ class BenchControls(_Controls):
             If it has other drivers, ports or serial numbers, or cannot be read.
         """
         # A file that is followed here is not opened again: HDF5 would show it as it was before.
-        if path in self._own or any(each.out == path for each in self.started):
-            return
-        if is_of(path, self.bench):
-            return
-        raise HuddleError(
-            f"{path.name} is recorded by another bench, and is only shown here: stop it from the"
-            f" window of that bench, or by huddle tui {path}"
-        )
+        is_followed = path in self._own or any(each.out == path for each in self.started)
+        if not is_followed and not is_of(path, self.bench):
+            raise HuddleError(
+                f"{path.name} is recorded by another bench, and is only shown here: stop it from"
+                f" the window of that bench, or by huddle tui {path}"
+            )
 
     def find_running(self) -> Path | None:
         """Return the file of a running recorder of this bench, if there is one."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tui.commands.estimate import exit_with, show_result
-from tui.commands.options import command, with_estimate_options, with_logging
+from tui.commands.options import command, with_logging, with_spanned_options
 from tui.output.console import console, write_text
 
 if TYPE_CHECKING:
@@ -23,12 +23,10 @@ if TYPE_CHECKING:
 
 @command()
 @with_logging
-@with_estimate_options
+@with_spanned_options
 def watch(
     file: Path,
     *,
-    start: str | None = None,
-    end: str | None = None,
     json: str | None = None,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> None:
@@ -45,9 +43,9 @@ def watch(
     if json is None and sys.stdout.isatty() and sys.stdin.isatty():
         from tui.commands.tui import open_recording
 
-        open_recording(file, start=start, end=end, **wanted)
+        open_recording(file, **wanted)
         return
-    settings, bench = settings_for(file, start=start, end=end, **wanted)
+    settings, bench = settings_for(file, **wanted)
     lines = _Lines(file, json, bench)
     try:
         follow(file, settings, lines)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
@@ -98,5 +97,5 @@ def _draw_series(series: Series, axes: Axes, number: int) -> None:
     ).T
     colour = f"C{number}"
     axes.plot(x, theory, color=colour, lw=1.0)
-    bars = partial(axes.errorbar, fmt=MARKERS[number % len(MARKERS)], color=colour, **_BARS)
-    bars(x, measured, yerr=2 * error, label=series.title)
+    marker, label = MARKERS[number % len(MARKERS)], series.title
+    axes.errorbar(x, measured, 2 * error, fmt=marker, color=colour, label=label, **_BARS)

@@ -137,9 +137,8 @@ def levels(test: str, result: Result) -> Iterator[Level]:
             channels = zip(snapshot.channels, data, row, upper, strict=True)
             for label, samples, (value, least, most), bound_above in channels:
                 own = (test, label.sensor, label.channel, label.unit, low, high, method)
-                numbers = map(_db, (samples, value, least, most))
                 is_above = method != BOUND and bool(least > bound_above)
-                yield Level(*own, *numbers, contradicts=is_above)
+                yield Level(*own, _db(samples), _db(value), _db(least), _db(most), is_above)
 
 
 def _db(psd: float) -> float:
