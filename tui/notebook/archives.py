@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -37,12 +37,12 @@ class StationAnswers(Mapping[str, "Answer"]):
         What could not be taken or read of all stations.
     """
 
-    def __init__(self, kept: Mapping[str, _Kept], problems: Sequence[str]) -> None:
+    def __init__(self, kept: Mapping[str, Callable[[], Answer]], problems: Sequence[str]) -> None:
         self._kept = dict(sorted(kept.items()))
         self.problems = tuple(problems)
 
     def __getitem__(self, station: str) -> Answer:
-        return self._kept[station].answer()
+        return self._kept[station]()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._kept)
@@ -54,18 +54,13 @@ class StationAnswers(Mapping[str, "Answer"]):
         return f"<answers of {len(self)} stations: {' '.join(self)}>"
 
 
-class _Kept:
-    """An archive, and how it is asked."""
-
-    def __init__(self, store: Store, settings: Settings, zone: ZoneInfo, rate: float) -> None:
-        self._store, self._settings, self._zone, self._rate = store, settings, zone, rate
-
-    def answer(self, failures: Sequence[str] = ()) -> Answer:
-        entries, bad = self._store.entries()
-        found = answer(
-            self._store, entries, self._settings, zone=self._zone, false_alarm=self._rate
-        )
-        return replace(found, problems=(*failures, *bad, *found.problems))
+def _answer(
+    store: Store, settings: Settings, zone: ZoneInfo, rate: float, failures: Sequence[str] = ()
+) -> Answer:
+    """Return the answer of an archive, with what failed before."""
+    entries, bad = store.entries()
+    found = answer(store, entries, settings, zone=zone, false_alarm=rate)
+    return replace(found, problems=(*failures, *bad, *found.problems))
 
 
 class ArchiveOptions(EstimateOptions, total=False):
@@ -211,13 +206,13 @@ def archive(
             [Path(each) for each in given], partial(_settings_for, options=options)
         )
     kept = {
-        name: _Kept(each, each.plan.changed(wanted, stretch), zone, false_alarm)
+        name: partial(_answer, each, each.plan.changed(wanted, stretch), zone, false_alarm)
         for name, each in stores.items()
     }
     if by_station:
         return StationAnswers(kept, failures)
     _check_one(kept)
-    return kept.popitem()[1].answer(failures)
+    return kept.popitem()[1](failures)
 
 
 def _check_one(names: Iterable[str]) -> None:

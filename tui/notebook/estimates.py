@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 PathLike: TypeAlias = "str | os.PathLike[str]"
 Response: TypeAlias = "PathLike | Any"
 """A file or folder of responses, an Inventory or Response of ObsPy, or poles and zeros."""
-"""Sensors that a method takes; three if it is not named here."""
 
 
 def self_noise(
@@ -126,7 +125,8 @@ def self_noise(
     _check_sensors(recording.sensors, settings)
     _check_units(recording.sensors, settings)
     check_fit(settings, recording.sensors, called=called)
-    return _result([recording], settings)
+    with Estimation([recording], settings) as estimation:
+        return Result(estimation.finish(), settings, recorded=_recorded(recording))
 
 
 def estimate(
@@ -255,11 +255,6 @@ def estimate(
     )
     with Estimation(paths, settings) as estimation:
         return Result(estimation.finish(), settings, bench, paths, recorded)
-
-
-def _result(recordings: Sequence[ReadableRecording], settings: Settings) -> Result:
-    with Estimation(recordings, settings) as estimation:
-        return Result(estimation.finish(), settings, recorded=_recorded(recordings[0]))
 
 
 def _recorded(recording: ReadableRecording) -> dict[str, Channel]:

@@ -64,17 +64,13 @@ def _certificates(found: Calibration, snapshot: Snapshot) -> KeyValues:
     """Return the certificates of the reference, a line each."""
     name = snapshot.sensor_names[found.reference]
     labels = [label for label in snapshot.channels if label.sensor == name]
-    return KeyValues(
-        tuple(
-            (
-                f"Certificate of {label.name}",
-                f"{each.value:.8g} counts per unit, U = {each.expanded_uncertainty:.3g} "
-                f"(k = {each.k:g}), {'date not given' if each.date is None else each.date}"
-                + (f", {each.number}" if each.number else ""),
-            )
-            for label, each in zip(labels, found.certificates, strict=True)
-        )
-    )
+    rows = []
+    for label, each in zip(labels, found.certificates, strict=True):
+        said = f"{each.value:.8g} counts per unit, U = {each.expanded_uncertainty:.3g}"
+        said += f" (k = {each.k:g}), {'date not given' if each.date is None else each.date}"
+        said += f", {each.number}" if each.number else ""
+        rows.append((f"Certificate of {label.name}", said))
+    return KeyValues(tuple(rows))
 
 
 LONG_NAME = 8

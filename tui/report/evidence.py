@@ -236,21 +236,11 @@ def events_section(result: Result) -> Section:
     if not logged_events:
         parts.append(Paragraph("The recordings hold no events.", "quiet"))
         return Section("The recording against time", tuple(parts))
-    together = _together(logged_events)
-    rows = [
-        (
-            _when(each.utc_ns),
-            each.sensor or "all",
-            each.kind if each.kind in _USUAL else Cell(each.kind, "doubtful"),
-            each.text
-            + (
-                f" ({count} of this kind, until {_when(last, after=each.utc_ns)})"
-                if count > 1
-                else ""
-            ),
-        )
-        for each, count, last in together
-    ]
+    rows = []
+    for each, count, last in _together(logged_events):
+        until = f" ({count} of this kind, until {_when(last, after=each.utc_ns)})" * (count > 1)
+        kind = each.kind if each.kind in _USUAL else Cell(each.kind, "doubtful")
+        rows.append((_when(each.utc_ns), each.sensor or "all", kind, each.text + until))
     left = len(rows) - LISTED
     header = ("when (UTC)", "sensor", "what", "in words")
     parts.append(Table(header, tuple(rows[:LISTED]), left=frozenset(range(4))))
