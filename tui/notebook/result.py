@@ -17,6 +17,8 @@ from daq.results.sources import LoggedEvent, uncounted_events
 from estimator.levels.bands import band_edges
 from tui.notebook import text
 from tui.output.extras import load
+from tui.page.table import Table
+from tui.wording.formatting import level, level_with_error
 
 if TYPE_CHECKING:
     import os
@@ -132,15 +134,18 @@ class BandNoise:
         return levels_db(self.noise_psd)
 
     def __repr__(self) -> str:
-        return text.band(
-            self.channels,
-            self.data_psd,
-            self.noise_psd,
-            self.noise_high,
-            span=(self.low_hz, self.high_hz),
-            method=self.method,
-            confidence=self.confidence,
+        values = zip(self.channels, self.data_psd, self.noise_psd, self.noise_high, strict=True)
+        rows = (
+            (label.sensor, label.channel, level(data), level_with_error(mean, high))
+            for label, data, mean, high in values
         )
+        right = ("data", self.method)
+        title = (
+            f"Self-noise, mean over {self.low_hz:.3g} to {self.high_hz:.3g} Hz, dB re 1"
+            f" ({self.channels[0].unit})²/Hz, with its {100 * self.confidence:g} % interval"
+        )
+        table = Table.of(("sensor", "channel", *right), rows, right=right)
+        return text.rendered([title, table])
 
 
 class Result:

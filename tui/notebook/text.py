@@ -15,15 +15,12 @@ from tui.page import html as page
 from tui.page.blocks import Paragraph, Part
 from tui.page.table import Table
 from tui.page.terminal import styled, terminal_table
-from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import Decision, facts_below
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daq.estimation.snapshot import ChannelLabel
     from daq.results.result import Result
-    from estimator.types import FloatArray
 
 _WIDTH = 100
 
@@ -57,34 +54,6 @@ def html(result: Result) -> str:
     below = (averages_line(result.snapshot), *(each.line for each in result.facts))
     blocks: list[Part] = [*map(Paragraph, _decision(result)), table, *map(Paragraph, below)]
     return "".join(page.html(each) for each in blocks)
-
-
-def band(
-    labels: Sequence[ChannelLabel],
-    data_psd: FloatArray,
-    noise_psd: FloatArray,
-    noise_high: FloatArray,
-    *,
-    span: tuple[float, float],
-    method: str,
-    confidence: float = 0.95,
-) -> str:
-    """Return a table of channels with their means over a band."""
-    rows = (
-        (
-            label.sensor,
-            label.channel,
-            level(float(data)),
-            level_with_error(float(mean), float(high)),
-        )
-        for label, data, mean, high in zip(labels, data_psd, noise_psd, noise_high, strict=True)
-    )
-    table = Table.of(("sensor", "channel", "data", method), rows, right=("data", method))
-    title = (
-        f"Self-noise, mean over {span[0]:.3g} to {span[1]:.3g} Hz, dB re 1"
-        f" ({labels[0].unit})²/Hz, with its {100 * confidence:g} % interval"
-    )
-    return rendered([Text(title), table])
 
 
 def rendered(parts: Sequence[RenderableType | Table]) -> str:

@@ -136,21 +136,13 @@ def outcome(
     motion = truth - np.diag(np.diag(mix[:, 2:]) ** 2)
     noises = np.diag(mix[:, 2:])[None] ** 2
     bias = float(BIAS[method](motion, noises, dims=dims)[0, 0])
-    n_bins = len(estimate)
+    mean, deviation, n_bins = estimate.mean(), estimate.std(ddof=1), len(estimate)
+    bias_error = spread * (1 + bias) / np.sqrt(n_bins)
+    # of a normal sample's deviation, and of the mean that it is divided by
+    cov_error = spread * np.sqrt((0.5 + spread**2) / n_bins)
     return (
-        Point(
-            x=x,
-            measured=float(estimate.mean() / noise - 1),
-            theory=bias,
-            error=spread * (1 + bias) / np.sqrt(n_bins),
-        ),
-        Point(
-            x=x,
-            measured=float(estimate.std(ddof=1) / estimate.mean()),
-            theory=spread,
-            # of a normal sample's deviation, and of the mean that it is divided by
-            error=spread * np.sqrt((0.5 + spread**2) / n_bins),
-        ),
+        Point(x, measured=float(mean / noise - 1), theory=bias, error=bias_error),
+        Point(x, measured=float(deviation / mean), theory=spread, error=cov_error),
     )
 
 
