@@ -130,7 +130,7 @@ def segment_findings(
     groups = groups[:n_good]
     if not groups:
         return _louder_than_others(found, course, there, dims)
-    step = float(np.median(np.diff(course.times)))
+    step = float(median(np.diff(course.times)))
     mixing = np.stack([(np.abs(residuals.projector[group]) ** 2).sum(axis=0) for group in groups])
     found = replace(
         found, loudness=Loudness.of(np.stack(powers[:n_good]), mixing, step, lasts=LASTS)

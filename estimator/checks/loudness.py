@@ -15,6 +15,7 @@ import numpy as np
 from estimator.checks.steadiness import FALSE_ALARM
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import critical_value
+from estimator.median import median
 from estimator.records import dataclass
 from estimator.spectra.parts import Parts
 from estimator.types import BoolArray, FloatArray
@@ -99,7 +100,7 @@ class Loudness:
         known = np.flatnonzero(parts.bins < len(good))
         known = known[good[parts.bins[known]]]
         averages = parts.averages
-        each = np.flatnonzero(averages > np.median(averages) / 2)
+        each = np.flatnonzero(averages > median(averages) / 2)
         n_groups = min(GROUPS, len(known) // LEAST_GROUP)
         if n_groups < 2 or len(each) < LEAST_TIMES:
             return cls.steady(psd.shape[1])
