@@ -23,6 +23,10 @@ LINE, LINES = 6, 0.1
 """Frequencies of a band at most, or their share, of which lines of one sensor make it fail."""
 STANDS_OUT = 1e-6
 """p value of a frequency below which it may be one of them."""
+AMBIGUOUS = 3
+"""Sensors of which a line of one looks like one that the two others share, but for its power."""
+ALONE = 4.0
+"""Excess of a line in the spectra of a sensor over that in any other's, from which it is its own."""
 LOOK = 16
 """Frequencies of a band at which sensors are tried first."""
 
@@ -76,9 +80,12 @@ def beside_matrices(
             of_each = [model_test(fits(out, each), n_effective=n_effective) for each in ones]
             best = int(np.argmin([np.nansum(each.statistic) for each in of_each]))
             both = pool(model, others, neighbours=neighbours), pool(of_each[best], out >= 0)
-            if min(each.p_value for each in both) >= rejected:
-                first = int(np.argmax(np.array(ones[best]) > 1))
-                lines[out] = np.searchsorted(np.cumsum(dims), first, side="right")
+            first = int(np.argmax(np.array(ones[best]) > 1))
+            own = int(np.searchsorted(np.cumsum(dims), first, side="right"))
+            if min(each.p_value for each in both) >= rejected and (
+                len(dims) > AMBIGUOUS or _is_louder(part.psd, out, others, dims, own)
+            ):
+                lines[out] = own
                 _put(found, of_each[best], out)
                 continue
         least = [np.nansum(each.discrepancy[some]) for each in looks]
@@ -90,6 +97,16 @@ def beside_matrices(
             widened[number] = True
             _put(found, beside, rows)
     return ModelTest(*found), widened, lines
+
+
+def _is_louder(
+    psd: FloatArray, out: IntArray, others: BoolArray, dims: tuple[int, ...], sensor: int
+) -> bool:
+    """Return whether lines stand out in the spectra of one sensor alone."""
+    more = psd[out].mean(axis=0) / psd[others].mean(axis=0) - 1
+    of_sensors = np.maximum.reduceat(more, np.cumsum([0, *dims[:-1]]))
+    own = of_sensors[sensor]
+    return bool(own > ALONE * max(np.delete(of_sensors, sensor).max(), 0.0))
 
 
 def _put(found: list[FloatArray], test: ModelTest, rows: IntArray) -> None:

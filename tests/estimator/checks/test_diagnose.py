@@ -427,18 +427,28 @@ def test_lists_are_accepted_like_arrays() -> None:
     np.testing.assert_array_equal(lists.snr, array.snr)
 
 
-@pytest.mark.parametrize("hum", [30.0, 3000.0])  # below and above the motion
-def test_hum_of_one_sensor_is_its_noise_and_no_misfit(hum: float) -> None:
+@pytest.mark.parametrize(("hum", "n"), [(30.0, 4), (3000.0, 3)])  # below and above the motion
+def test_hum_of_one_sensor_is_its_noise_and_no_misfit(hum: float, n: int) -> None:
     """It failed the model test of its band, and other sensors were said to share noise."""
-    turned = [Rotation.random(random_state=seed).as_matrix() for seed in range(3)]
+    turned = [Rotation.random(random_state=seed).as_matrix() for seed in range(n)]
     csm = np.repeat(bench(*turned)[None], len(FREQUENCY), axis=0)
     csm[60:63, 3:6, 3:6] += hum  # equal in all channels of the second
-    found = of(csm)
+    found = of(csm, dims=(3,) * n)
     (lines,) = advice_of(LinesOfOne, found)
     assert lines.sensors == (1,)
     np.testing.assert_allclose(lines.frequencies, FREQUENCY[61:62])
     assert not advice_of(ModelMisfit, found)
     assert not advice_of(SharedNoise, found)
+
+
+@pytest.mark.parametrize("hum", [30.0, 3000.0])
+def test_hum_of_two_sensors_is_no_line_of_the_third(hum: float) -> None:
+    """It looks like one, but for the power."""
+    csm = np.repeat(bench(*[np.eye(3)] * 3)[None], len(FREQUENCY), axis=0)
+    csm[60:63, 3:, 3:] += hum
+    found = of(csm)
+    assert advice_of(ModelMisfit, found)
+    assert not advice_of(LinesOfOne, found)
 
 
 def test_motion_that_differs_at_some_frequencies_is_no_line() -> None:
