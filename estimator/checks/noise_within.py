@@ -26,7 +26,7 @@ STANDS_OUT = 1e-6
 AMBIGUOUS = 3
 """Sensors of which a line of one looks like one that the two others share, but for its power."""
 ALONE = 4.0
-"""Excess of a line in the spectra of a sensor over that in any other's, from which it is its own."""
+"""Excess of a line in spectra of a sensor over that in any other, from which it is its own."""
 LOOK = 16
 """Frequencies of a band at which sensors are tried first."""
 
