@@ -74,14 +74,25 @@ class SharedNoise(Advice):
 
 
 class LinesOfOne(Advice):
-    """One sensor has lines that no other has, such as hum: they are its noise."""
+    """One sensor has lines that no other has, such as hum: they are its noise.
+
+    Without a sensor: either one of three has them, or the other two have them in common.
+    """
 
     frequencies: tuple[Hertz, ...]
 
     def _words(self, names: Names) -> Words:
         each = [f"{frequency:.3g}" for frequency in self.frequencies]
-        who = names.list_sensors(self.sensors)
         line = "a line" if len(each) == 1 else "lines"
+        if not self.sensors:
+            return Words(
+                f"One sensor, or two, have {line} at {few(each)} Hz: hum, or other interference",
+                f"Either one sensor has {line} at {listed(each)} Hz that no other has, or the other"
+                " two have them in common: hum or another interference. The motion there is too "
+                "strong to tell.",
+                "Record with less motion, or with a fourth sensor. Check cables, ground and power.",
+            )
+        who = names.list_sensors(self.sensors)
         return Words(
             f"{who} alone has {line} at {few(each)} Hz: hum, or other interference",
             f"{who} has {line} at {listed(each)} Hz that no other sensor has: its noise, such as "

@@ -22,7 +22,7 @@ from estimator.checks.advice_on_noise import (
 )
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.disturbed_segments import SegmentCourse
-from estimator.checks.noise_within import beside_matrices
+from estimator.checks.noise_within import UNDECIDED, beside_matrices
 from estimator.checks.relative_response import (
     PARTNERS,
     RelativeResponse,
@@ -411,13 +411,15 @@ def _without_lines(fit: Maximum | Untested, lines: IntArray) -> Maximum | Untest
 
 
 def _lines(sensor: IntArray, frequency: FloatArray, sensors: Sequence[int]) -> Iterator[LinesOfOne]:
-    """Yield what each sensor has alone at single frequencies, given by sensor or -1."""
+    """Yield what each sensor has alone at single frequencies, as from `beside_matrices`."""
     for number in sorted({*sensor.tolist()} - {-1}):
         own = np.flatnonzero(sensor == number)
         middles = [each.mean() for each in np.split(own, np.flatnonzero(np.diff(own) > 1) + 1)]
         at = np.interp(middles, np.arange(len(frequency)), frequency)
         yield LinesOfOne(
-            rank=Rank.TO_KNOW, sensors=(sensors[number],), frequencies=tuple(at.tolist())
+            rank=Rank.DELAYS if number == UNDECIDED else Rank.TO_KNOW,
+            sensors=() if number == UNDECIDED else (sensors[number],),
+            frequencies=tuple(at.tolist()),
         )
 
 

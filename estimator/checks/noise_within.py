@@ -27,6 +27,7 @@ AMBIGUOUS = 3
 """Sensors of which a line of one looks like one that the two others share, but for its power."""
 ALONE = 4.0
 """Excess of a line in spectra of a sensor over that in any other, from which it is its own."""
+UNDECIDED = -2
 LOOK = 16
 """Frequencies of a band at which sensors are tried first."""
 
@@ -46,7 +47,8 @@ def beside_matrices(
 
     Not of all sensors: motion that differs between three sensors fits matrices of all three. Also
     returns whether it is such a test, in each of the bands `insides`; and the sensor of lines, such
-    as hum, which alone make a band fail, at each frequency: -1 elsewhere.
+    as hum, which alone make a band fail, at each frequency: `UNDECIDED` where two sensors may have
+    them, -1 elsewhere.
     """
     tests = [pool(model, inside, neighbours=neighbours) for inside in insides]
     rejected = rejected_below(tests)
@@ -82,11 +84,11 @@ def beside_matrices(
             both = pool(model, others, neighbours=neighbours), pool(of_each[best], out >= 0)
             first = int(np.argmax(np.array(ones[best]) > 1))
             own = int(np.searchsorted(np.cumsum(dims), first, side="right"))
-            if min(each.p_value for each in both) >= rejected and (
-                len(dims) > AMBIGUOUS or _is_louder(part.psd, out, others, dims, own)
-            ):
-                lines[out] = own
-                _put(found, of_each[best], out)
+            if min(each.p_value for each in both) >= rejected:
+                is_known = len(dims) > AMBIGUOUS or _is_louder(part.psd, out, others, dims, own)
+                lines[out] = own if is_known else UNDECIDED
+                if is_known:
+                    _put(found, of_each[best], out)
                 continue
         least = [np.nansum(each.discrepancy[some]) for each in looks]
         best = int(np.argmin(least))

@@ -129,6 +129,7 @@ EXAMPLES: tuple[Advice, ...] = (
     SHARED,
     replace(SHARED, sensors=(0,), channels=((0, 1),), coherencies=(0.1,), standard_errors=(0.01,)),
     LinesOfOne(rank=Rank.TO_KNOW, sensors=(1,), frequencies=(16.7, 33.4)),
+    LinesOfOne(rank=Rank.DELAYS, frequencies=(16.7,)),
     DisturbedSegments(
         rank=Rank.DELAYS,
         sensors=(1,),
