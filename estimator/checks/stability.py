@@ -289,6 +289,14 @@ def _in_all_bands(
     return np.where(moved & (explained == 0), explained.max(axis=0), explained)
 
 
+def _groups(averages: FloatArray, q: int, n_channels: int) -> tuple[list[IntArray], bool]:
+    """Return parts joined to groups, and whether these say only that responses change."""
+    groups = grouped(averages, q + max(MIN_DEGREES, n_channels))
+    if len(groups) >= MIN_PARTS:
+        return groups, False
+    return grouped(averages, max(q + MIN_DEGREES, float(averages.sum()) / FEW_PARTS)), True
+
+
 FEW_PARTS = 4
 """Parts of a short recording, in which each has fewer averages than channels."""
 
@@ -339,8 +347,7 @@ def stability(
     every, places = (places[each[parts.bins[places]]] for each in (known, good))
     averages = parts.averages
     q = maximum.n_factors
-    most = float(averages.sum()) / FEW_PARTS
-    groups = grouped(averages, q + max(MIN_DEGREES, min(maximum.psi.shape[1], most - q)))
+    groups, is_short = _groups(averages, q, maximum.psi.shape[1])
     if len(groups) < MIN_PARTS:
         return None
     runs = np.array([each.run for each in parts.each])
@@ -404,7 +411,6 @@ def stability(
         time=(begin, end),
     )
     explained = np.maximum(explained, left)
-    is_short = most < q + n_channels  # parts say that responses change, and nothing within them
     without = (
         steadied(parts, maximum, psd, good=good, insides=insides)
         if (changes or suspect) and not is_short
