@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.checks.loudness import LASTS, Loudness, across
+from estimator.checks.loudness import LASTS, Loudness, across, without_bursts
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
@@ -121,9 +121,10 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    gains, powers = _Gains(own, groups, dims), []
+    gains, powers, felt = _Gains(own, groups, dims), [], []
     for residual, motion in residuals:
         powers.append((np.abs(residual) ** 2).sum(axis=1))
+        felt.append((np.abs(motion) ** 2).sum(axis=(1, 2)))
         gains.add(residual, motion)
     variance, sure = gains.variance()
     found = replace(none, gains=variance, sure=sure)
@@ -132,8 +133,9 @@ def segment_findings(
         return _louder_than_others(found, course, there, dims)
     step = float(median(np.diff(course.times)))
     mixing = np.stack([(np.abs(residuals.projector[group]) ** 2).sum(axis=0) for group in groups])
+    calm = without_bursts(np.stack(felt[:n_good]))
     found = replace(
-        found, loudness=Loudness.of(np.stack(powers[:n_good]), mixing, step, lasts=LASTS)
+        found, loudness=Loudness.of(np.stack(powers[:n_good])[:, calm], mixing, step, lasts=LASTS)
     )
     degrees = np.array([own[group].sum() for group in groups])
     out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)

@@ -28,6 +28,8 @@ MOST_BINS, GROUPS = 128, 8
 """Frequencies of parts, and groups of these."""
 LEAST_GROUP, LEAST_TIMES = 4, 8
 """Frequencies of a group, and segments or parts, at least."""
+BURST = 8.0
+"""Power of the motion over its usual one, from which it says nothing of the noise."""
 NEIGHBOURS = 1.5
 """Sum of the squared correlations of differences in time, of which each shares a value with two."""
 
@@ -105,7 +107,7 @@ class Loudness:
         if n_groups < 2 or len(each) < LEAST_TIMES:
             return cls.steady(psd.shape[1])
         known = known[np.linspace(0, len(known) - 1, min(len(known), MOST_BINS)).astype(np.int64)]
-        power, mixing = [], []
+        power, mixing, motion = [], [], []
         for some in np.array_split(known, n_groups):
             at = maximum.take(parts.bins[some])
             u = at.eigenvectors
@@ -114,13 +116,15 @@ class Loudness:
             root = np.sqrt(fitted / psd[parts.bins[some]])
             csm = parts.csm(some)[each] * (root[:, :, None] * root[:, None])
             felt = csm @ u
+            motion.append((u.conj() * felt).real.sum(axis=(1, 2, 3)))
             twice = u @ (u.conj().swapaxes(1, 2) @ felt) - 2 * felt
             left = np.einsum("kfpp->kfp", csm).real + (twice * u.conj()).sum(axis=3).real
             power.append(left.sum(axis=1))
             mixing.append((np.abs(at.projector) ** 2).sum(axis=0))
         found, first = cls.steady(psd.shape[1]), parts.each[each[0]]
+        every = np.stack(power)[:, without_bursts(np.stack(motion))]
         for together in (1, 2):
-            own = np.stack(power)[:, : len(each) // together * together]
+            own = every[:, : every.shape[1] // together * together]
             own = own.reshape(n_groups, -1, together, own.shape[2]).sum(axis=2)
             step = together * (first.end - first.begin)
             found = found.joined(cls.of(own, np.stack(mixing), step))
@@ -141,6 +145,14 @@ class Loudness:
     @property
     def _fields(self) -> FloatArray:
         return np.stack([self.size, self.lasts, self.deviation])
+
+
+def without_bursts(motion: FloatArray) -> BoolArray:
+    """Return the times without a burst of the motion, of powers (n_groups, n_times).
+
+    What directions of the whole recording leave of a burst follows its loudness.
+    """
+    return np.asarray((motion <= BURST * median(motion.T)[:, None]).all(axis=0))
 
 
 def across(one: FloatArray, other: FloatArray) -> FloatArray:
