@@ -131,9 +131,8 @@ def _faulty(snapshot: Snapshot, psd: FloatArray) -> Contribution:
     below, above = np.zeros((2, *psd.shape))
     below[:, sorted(snapshot.diagnostics.faulty)] = math.inf
     below[:, _disturbed(snapshot)] = math.inf
-    for column, seconds in snapshot.diagnostics.stood_still.items():
-        lost = min(2 * seconds / snapshot.elapsed, 0.5)  # it reaches into the parts beside
-        above[:, column] = psd[:, column] * lost / (1 - lost)
+    still = sorted(snapshot.diagnostics.stood_still)  # half of the time at most: its noise lacks
+    above[:, still] = psd[:, still]
     return contribution(Source.FAULTY, psd.shape, below=below, above=above)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from estimator.likelihood.factor_analysis import Maximum, maximise, n_noise
 from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool, rejected_below
+from estimator.median import median
 from estimator.self_noise.coherency import Coherency, testable
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -27,6 +28,8 @@ AMBIGUOUS = 3
 """Sensors of which a line of one looks like one that the two others share, but for its power."""
 ALONE = 4.0
 """Excess of a line in spectra of a sensor over that in any other, from which it is its own."""
+TONE = 1.0
+"""The same from which others have the line, too: the motion of a machine."""
 UNDECIDED = -2
 LOOK = 16
 """Frequencies of a band at which sensors are tried first."""
@@ -84,8 +87,10 @@ def beside_matrices(
             both = pool(model, others, neighbours=neighbours), pool(of_each[best], out >= 0)
             first = int(np.argmax(np.array(ones[best]) > 1))
             own = int(np.searchsorted(np.cumsum(dims), first, side="right"))
-            if min(each.p_value for each in both) >= rejected:
-                is_known = len(dims) > AMBIGUOUS or _is_louder(part.psd, out, others, dims, own)
+            excess = _excess(part.psd, out, others, dims)
+            most = float(np.delete(excess, own).max())  # a tone that all feel tells of responses
+            if most < TONE and min(each.p_value for each in both) >= rejected:
+                is_known = len(dims) > AMBIGUOUS or bool(excess[own] > ALONE * max(most, 0.0))
                 lines[out] = own if is_known else UNDECIDED
                 if is_known:
                     _put(found, of_each[best], out)
@@ -101,14 +106,10 @@ def beside_matrices(
     return ModelTest(*found), widened, lines
 
 
-def _is_louder(
-    psd: FloatArray, out: IntArray, others: BoolArray, dims: tuple[int, ...], sensor: int
-) -> bool:
-    """Return whether lines stand out in the spectra of one sensor alone."""
-    more = psd[out].mean(axis=0) / psd[others].mean(axis=0) - 1
-    of_sensors = np.maximum.reduceat(more, np.cumsum([0, *dims[:-1]]))
-    own = of_sensors[sensor]
-    return bool(own > ALONE * max(np.delete(of_sensors, sensor).max(), 0.0))
+def _excess(psd: FloatArray, out: IntArray, others: BoolArray, dims: tuple[int, ...]) -> FloatArray:
+    """Return by how much lines stand out in the spectra of each sensor, as a share."""
+    more = psd[out].mean(axis=0) / median(psd[others]) - 1
+    return np.asarray(np.maximum.reduceat(more, np.cumsum([0, *dims[:-1]])))
 
 
 def _put(found: list[FloatArray], test: ModelTest, rows: IntArray) -> None:

@@ -441,15 +441,24 @@ def test_hum_of_one_sensor_is_its_noise_and_no_misfit(hum: float, n: int) -> Non
     assert not advice_of(SharedNoise, found)
 
 
-@pytest.mark.parametrize("hum", [30.0, 3000.0])
-def test_hum_of_two_sensors_is_no_line_of_the_third(hum: float) -> None:
-    """It looks like one, but for the power."""
+@pytest.mark.parametrize(("hum", "is_line"), [(30.0, True), (3000.0, False)])
+def test_hum_of_two_sensors_is_no_line_of_the_third(hum: float, *, is_line: bool) -> None:
+    """It looks like one, but for the power: that of two may be motion that the third lacks."""
     csm = np.repeat(bench(*[np.eye(3)] * 3)[None], len(FREQUENCY), axis=0)
     csm[60:63, 3:, 3:] += hum
     found = of(csm)
     assert advice_of(ModelMisfit, found)
-    (line,) = advice_of(LinesOfOne, found)
-    assert (line.rank, line.sensors) == (Rank.DELAYS, ())
+    lines = [(each.rank, each.sensors) for each in advice_of(LinesOfOne, found)]
+    assert lines == [(Rank.DELAYS, ())] * is_line
+
+
+def test_a_tone_that_all_feel_is_no_line_of_the_sensor_whose_gain_moves() -> None:
+    turned = [Rotation.random(random_state=seed).as_matrix() for seed in range(4)]
+    csm = np.repeat(bench(*turned)[None], len(FREQUENCY), axis=0)
+    felt = np.concatenate([each @ np.array([0.6, 0.5, 0.62]) for each in turned])
+    moved = np.where(np.arange(12) // 3 == 1, felt, 0.0)  # independent of the tone, on average
+    csm[60:63] += 1e5 * np.outer(felt, felt) + 1e5 * 0.02**2 * np.outer(moved, moved)
+    assert not advice_of(LinesOfOne, of(csm, dims=(3,) * 4))
 
 
 def test_motion_that_differs_at_some_frequencies_is_no_line() -> None:
