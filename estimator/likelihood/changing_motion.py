@@ -521,11 +521,20 @@ def bound_of_parts(
 
 
 def _units(csm: ComplexArray, n: FloatArray, model: _Model) -> FloatArray:
-    """Return the root of what the others do not predict of every channel, in the mean bin."""
+    """Return the root of what the others do not predict of every channel, in the mean bin.
+
+    Raises
+    ------
+    InsufficientDataError
+        If a channel repeats another.
+    """
     mean = np.tensordot(n / n.sum(), csm, axes=(0, 1))
     psd = np.sqrt(np.einsum("fii->fi", mean).real)
     coherency = mean / (psd[:, :, None] * psd[:, None, :])
-    inverse = np.where(model.mask, np.linalg.inv(coherency), 0.0)
+    try:
+        inverse = np.where(model.mask, np.linalg.inv(coherency), 0.0)
+    except np.linalg.LinAlgError as error:
+        raise InsufficientDataError("a channel repeats another") from error
     rest = np.einsum("fii->fi", np.linalg.inv(inverse)).real
     return np.asarray(np.sqrt((rest * psd**2).mean(axis=0)))
 

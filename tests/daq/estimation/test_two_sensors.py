@@ -9,7 +9,7 @@ import pytest
 
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
-from daq.estimation.snapshot import Snapshot
+from daq.estimation.snapshot import NoResultError, Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.band_summary import data_interval
 from daq.results.facts.changes import (
@@ -23,6 +23,7 @@ from daq.results.facts.precision import PairCompared
 from daq.results.result import Result
 from estimator.checks.advice import Advice
 from estimator.checks.advice_on_noise import ResponseChanges
+from estimator.checks.advice_on_signals import Copies
 from estimator.self_noise.result import Flag, Refusal
 
 RATE, SECONDS = 50.0, 1500
@@ -224,3 +225,10 @@ def test_how_two_sensors_compare_is_a_fact_with_errors(d: int) -> None:
     assert np.all(np.abs(np.array(fact.gains) - 1) < 4 * np.array(fact.gain_errors))
     assert abs(fact.delay) < 4 * fact.delay_error < 1e-3
     assert np.isnan(fact.rotation) == (d == 1)
+
+
+def test_a_sensor_that_repeats_the_other_is_named() -> None:
+    samples = np.random.default_rng(1).standard_normal((12_000, 1))
+    with pytest.raises(NoResultError, match="repeats another") as caught:
+        estimate([recording_of_arrays({"A": samples, "B": samples}, 100.0)], Settings())
+    assert any(isinstance(each, Copies) for each in caught.value.snapshot.diagnostics.advice)
