@@ -259,7 +259,7 @@ def _with_neighbours(
     if len(rows) < len(found.flags) or not np.array_equal(columns, np.arange(len(sensor))):
         matrix = matrix[rows[:, None, None], columns[:, None], columns]
     del given  # as large as all averages
-    turn = phases(matrix, rows, live, n_effective)
+    turn = phases(matrix, rows, live, n_effective, number)
     if turn is not None:
         matrix = matrix * turn[:, :, None] * turn[:, None, :].conj()
     rest, _ = unpredicted(

@@ -22,12 +22,17 @@ BY_CHANCE = 1e-6
 
 
 def phases(
-    coherency: ComplexArray, line: IntArray, dims: tuple[int, ...], n_effective: float
+    coherency: ComplexArray,
+    line: IntArray,
+    dims: tuple[int, ...],
+    n_effective: float,
+    block: IntArray,
 ) -> ComplexArray | None:
     """Return what brings sensors into step, shape (n_lines, n_channels); None if all are.
 
     The lag of a sensor is that at which its cross-correlation with the sensor most coherent with
-    the others has most energy, of all pairs of their channels together: whatever their axes.
+    the others has most energy, of all pairs of their channels together: whatever their axes. It is
+    taken off in blocks in which their sum has more energy then: others may have other lags.
 
     Parameters
     ----------
@@ -38,6 +43,8 @@ def phases(
     dims : tuple of int
     n_effective : float
         Independent averages.
+    block : int64, shape (n_lines,)
+        From 0, rising.
     """
     first = np.cumsum((0, *dims[:-1]))
     shared = np.add.reduceat((np.abs(coherency) ** 2).sum(axis=0), first, axis=0)
@@ -47,7 +54,8 @@ def phases(
     n = FINE * (int(line[-1]) + 1)
     lags = np.rint(np.fft.fftfreq(n, 1 / n)).astype(np.int64)
     near = np.abs(lags) <= FARTHEST * n
-    turns = np.zeros(len(dims))
+    begins = np.flatnonzero(np.diff(block, prepend=-1))
+    turns = np.zeros((len(line), len(dims)))
     for sensor, (begin, d) in enumerate(zip(first, dims, strict=True)):
         if sensor == reference:
             continue
@@ -59,8 +67,14 @@ def phases(
         limit = k + 2 * math.sqrt(k * surprise) + 2 * surprise
         # twice that of chi squared over two: a window correlates neighbouring lines
         if energy[at] > limit * len(line) / n_effective:
-            turns[sensor] = lags[at] / n
+            both = (
+                series[line],
+                series[line] * np.exp(-2j * np.pi * line * lags[at] / n)[:, None, None],
+            )
+            alone, turned = (
+                (np.abs(np.add.reduceat(each, begins)) ** 2).sum(axis=(1, 2)) for each in both
+            )
+            turns[:, sensor] = line * lags[at] / n * (turned > alone)[block]
     if not turns.any():
         return None
-    turn = np.repeat(turns, dims)
-    return np.asarray(np.exp(-2j * np.pi * line[:, None] * turn))
+    return np.asarray(np.exp(-2j * np.pi * np.repeat(turns, dims, axis=1)))

@@ -71,4 +71,17 @@ def test_independent_sensors_do_not_lag(d: int) -> None:
         csm = drawn(rng, np.broadcast_to(np.eye(3 * d), (N_BINS, 3 * d, 3 * d)), 3 * d + 5)
         psd = np.sqrt(np.einsum("fii->fi", csm).real)
         coherency = csm / psd[:, :, None] / psd[:, None, :]
-        assert phases(coherency, LINES, (d,) * 3, 3.0 * d + 5) is None
+        assert phases(coherency, LINES, (d,) * 3, 3.0 * d + 5, 0 * LINES) is None
+
+
+def test_lag_of_strong_motion_is_not_taken_off_where_sensors_are_in_step() -> None:
+    block = (LINES >= N_BINS // 2).astype(np.int64)
+    turn = np.where(block, np.exp(-2j * np.pi * 13 / (FINE * N_BINS) * LINES), 0.1)
+    csm = np.repeat(np.eye(3, dtype=np.complex128)[None], N_BINS, axis=0)
+    csm[:, 0, 1] = csm[:, 1, 0] = np.abs(turn)
+    for one in (0, 1):
+        csm[:, 2, one], csm[:, one, 2] = turn, turn.conj()
+    found = phases(csm, LINES, (1, 1, 1), N, block)
+    assert found is not None
+    np.testing.assert_array_equal(found[block == 0], 1)
+    np.testing.assert_allclose(found[block == 1, 2] * turn[block == 1], 1)
