@@ -16,10 +16,10 @@ FloatArray = NDArray[np.float64]
 _PARTS = 8  # of a hop, examined one by one
 _MIN_SAMPLES = 32  # samples of a part
 _STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
-_STRAIGHT = 0.1  # of its change: what leaves the line through its ends less may be on it
-_SLOPE = 8  # counts from end to end, from which whole numbers follow a line
+_STRAIGHT = 0.03  # of its change: what leaves the line through its ends less may be on it
+_SLOPE = 16  # counts from end to end, from which whole numbers follow a line
 _ROUNDED = 1 + 1e-9  # counts: half of one at the ends, and half of one between
-_SMOOTH = 2  # sizes below the usual second difference, from which a line is no motion
+_SMOOTH = 3  # sizes below the usual second difference, from which a line is no motion
 _SIZES = 64  # factors of four, from 4**-32
 
 
