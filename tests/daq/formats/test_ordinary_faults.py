@@ -133,7 +133,7 @@ def test_all_arrays_of_a_file_together_become_no_more_than_it_can_hold(
     many: dict[str, Any] = {f"A{n}": np.zeros(1 << 16) for n in range(9)}
     np.savez_compressed(tmp_path / "a.npz", **many)
     savemat(tmp_path / "a.mat", many, do_compression=True)
-    for name in ("npz", "a.mat"):
+    for name in ("a.npz", "a.mat"):
         refused(tmp_path / name, "bytes that become 1", sampling_rate=100.0)
 
 
