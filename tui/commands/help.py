@@ -73,8 +73,7 @@ PANELS: dict[str, dict[str, str]] = {
 ASKED_BY_SHELL = "_HUDDLE_COMPLETE"
 """Environment variable by which a shell asks for completions."""
 COMMANDS = [name for panel in PANELS.values() for name in panel]
-_MODULES = {"import": "import_", "issues": "issue", "pin": "runs", "status": "runs"}
-_MODULES |= {"plot": "report", "repair": "verify", "sign": "verify", "simulate": "devices"}
+_MODULES = {"import": "import_", "issues": "issue", "pin": "runs"}
 """The module of a command that is not in one of its name."""
 
 _FIRST = "huddle.first"

@@ -1,4 +1,4 @@
-"""``huddle runs``, ``huddle pin`` and ``huddle status``: a service and its runs."""
+"""``huddle runs`` and ``huddle pin``: the runs of a service."""
 
 # ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
@@ -12,14 +12,11 @@ import typer
 
 from daq.caveats import Caveat
 from daq.errors import HuddleError
-from daq.recorder.schedule import utc_now
 from tui.commands.options import command
 from tui.output.console import check_places, for_people, write_json, write_text
 from tui.output.csv_text import csv_text
-from tui.output.exit_codes import ExitCode
 from tui.page.table import Cell, Table, Tone
 from tui.service.records.run_state import Run, RunState, utc_text
-from tui.service.records.store import RunStore
 
 _TONES: dict[RunState, Tone] = {
     RunState.FAILED: "bad",
@@ -149,29 +146,3 @@ def runs_named(runs: Sequence[Run], name: str) -> list[Run]:
             f"{name}: no such run; expected a recording or a due time as huddle runs shows them"
         )
     return found
-
-
-@command()
-def status(path: Path, *, json: str | None = None) -> None:
-    """Show the state of the service of a bench: runs, sensors, disk, clock.
-
-    The exit code is 3 if no service runs.
-
-    Examples
-    --------
-    huddle status lab.toml
-    huddle status lab.toml --json -
-    """
-    from daq.devices.bench_file import load
-    from tui.service.status import service_status, status_lines
-
-    bench = load(path)
-    runs = RunStore(bench.recording_directory).current(bench.name)
-    bench.recording_directory.mkdir(parents=True, exist_ok=True)
-    found = service_status(bench, runs, utc_now())
-    screen = for_people(json)
-    for line in status_lines(found):
-        screen.print(line, soft_wrap=True)
-    write_json(json, found)
-    if not found["running"]:
-        raise typer.Exit(ExitCode.TROUBLE)

@@ -1,4 +1,4 @@
-"""``huddle verify``, ``repair`` and ``sign``: checksums and signatures of recordings."""
+"""``huddle verify``: checksums and signatures of recordings, and certificates."""
 
 # ruff: noqa: PLC0415 - what the command needs is imported when it runs
 
@@ -15,7 +15,6 @@ from daq.errors import RecordingError
 from tui.certificate.ledger import Ledger
 from tui.commands.options import command
 from tui.output.console import for_people, write_json
-from tui.page.table import Table
 
 
 @command()
@@ -146,90 +145,3 @@ def _recordings(
         found += [place.folder / part for run in runs for part in run.parts]
         known |= {place.folder / part: own for part, own in place.store.identities().items()}
     return list(dict.fromkeys(found)), known_to_services(found) | known, folders
-
-
-@command()
-def repair(
-    path: Path,
-    *,
-    check: bool = False,
-    json: str | None = None,
-) -> None:
-    """Verify the checksums of a recording, and close it if a crash left it open.
-
-    All acknowledged samples are kept. Samples not acknowledged are removed.
-
-    Parameters
-    ----------
-    path : FILE
-        Recording (.h5).
-    check
-        Check only; change nothing.
-
-    Examples
-    --------
-    huddle repair killed.h5
-    huddle repair night.h5 --check --json -
-    """
-    from dataclasses import asdict
-
-    from daq.recording.repair import repair, verify
-
-    report = verify(path) if check else repair(path)
-    numbers = ("samples", "blocks", "gaps", "damaged blocks", "unacknowledged rows")
-    rows = (
-        (s.name, s.n_samples, s.n_blocks, s.n_gaps, len(s.bad_blocks), s.n_uncommitted)
-        for s in report.sensors
-    )
-    screen = for_people(json)
-    screen.print(Table.of(("sensor", *numbers), rows, right=numbers))
-    state = "being written" if report.being_written else "closed" if report.closed else "not closed"
-    screen.print(f"{path}: {state}")
-    write_json(json, asdict(report) | {"path": str(path)})
-    if not report.intact:
-        raise RecordingError(f"{path}: acknowledged blocks are damaged")
-
-
-@command()
-def sign(
-    recordings: list[Path] | None = None,
-    *,
-    key: Path | None = None,
-    new_key: Path | None = None,
-) -> None:
-    """Sign recordings with a private key, or make one.
-
-    A recording is verified before. Its signature is a file beside it (.sig).
-
-    Parameters
-    ----------
-    recordings : RECORDING
-        Closed recordings.
-    key : FILE
-        Private key (ed25519, PEM).
-    new_key : FILE
-        Make a key, and FILE.pub for others.
-
-    Examples
-    --------
-    huddle sign --new-key ~/lab.key
-    huddle sign lab.h5 --key ~/lab.key
-    """
-    from daq.recording.repair import verify
-    from daq.recording.signing import make_key, sign
-
-    recordings = recordings or []
-    screen = for_people(None)
-    if new_key is not None:
-        public = make_key(new_key)
-        screen.print(f"{new_key}: private key; keep it from those who can write recordings")
-        screen.print(f"{public}: public key, for huddle verify --key")
-    if recordings and key is None and new_key is None:
-        raise typer.BadParameter("no key; expected --key FILE")
-    if not recordings and new_key is None:
-        raise typer.BadParameter("nothing to sign; expected recordings, or --new-key FILE")
-    for path in recordings:
-        if not verify(path).intact:
-            raise RecordingError(f"{path}: damaged, and not signed; see huddle verify {path}")
-        signature = sign(path, key or new_key or path)
-        screen.print(f"{path}: signed with key {signature.key_id}", soft_wrap=True)

@@ -1,0 +1,41 @@
+"""``huddle status``: what the service of a bench does."""
+
+# ruff: noqa: PLC0415 - what the command needs is imported when it runs
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from daq.recorder.schedule import utc_now
+from tui.commands.options import command
+from tui.output.console import for_people, write_json
+from tui.output.exit_codes import ExitCode
+from tui.service.records.store import RunStore
+
+
+@command()
+def status(path: Path, *, json: str | None = None) -> None:
+    """Show the state of the service of a bench: runs, sensors, disk, clock.
+
+    The exit code is 3 if no service runs.
+
+    Examples
+    --------
+    huddle status lab.toml
+    huddle status lab.toml --json -
+    """
+    from daq.devices.bench_file import load
+    from tui.service.status import service_status, status_lines
+
+    bench = load(path)
+    runs = RunStore(bench.recording_directory).current(bench.name)
+    bench.recording_directory.mkdir(parents=True, exist_ok=True)
+    found = service_status(bench, runs, utc_now())
+    screen = for_people(json)
+    for line in status_lines(found):
+        screen.print(line, soft_wrap=True)
+    write_json(json, found)
+    if not found["running"]:
+        raise typer.Exit(ExitCode.TROUBLE)
