@@ -61,7 +61,7 @@ async def test_the_first_run_makes_its_folder_and_leaves_recording_result_and_ro
 ) -> None:
     path = tmp_path / "bench.toml"
     with simulated(parse(DEMO), speed=8.0) as reachable:
-        bench = scheduled(reachable, path, seconds=24.0)
+        bench = scheduled(reachable, path, seconds=48.0)
         store = RunStore(bench.recording_directory)
         task = asyncio.create_task(serve_runs(path, bench, {"overlap": 0.25}, clock=ClockAtDue()))
         async with asyncio.timeout(limit()):
