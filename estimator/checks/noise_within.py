@@ -79,7 +79,7 @@ def beside_matrices(
         failed, every, seen, map(slice, edges, edges[1:]), strict=False
     ):
         out = rows[model.p_value[rows] < STANDS_OUT]
-        if 0 < len(out) <= max(LINE, LINES * len(rows)):
+        if 0 < len(out) <= max(LINE, LINES * len(rows)) and len(out) < len(rows):
             others = insides[number].copy()
             others[out] = False
             of_each = [model_test(fits(out, each), n_effective=n_effective) for each in ones]

@@ -469,3 +469,14 @@ def test_motion_that_differs_at_some_frequencies_is_no_line() -> None:
     found = of(csm)
     assert advice_of(ModelMisfit, found)
     assert not advice_of(LinesOfOne, found)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_band_of_few_frequencies_that_all_fail_has_no_lines() -> None:
+    rng = np.random.default_rng(2)
+    felt = rng.standard_normal(9)
+    true = bench(*[np.eye(3)] * 3) + 300 * np.outer(felt, felt)
+    csm = wishart(np.broadcast_to(true, (5, 9, 9)), 1080, rng)[0]
+    found = diagnose(csm, FREQUENCY[:5], dims=THREE, n_effective=1080, neighbours=INDEPENDENT)
+    assert advice_of(ModelMisfit, found)
+    assert not advice_of(LinesOfOne, found)
