@@ -186,8 +186,8 @@ class SnapshotDiagnostics:
     counts : CountLimits
         Channels whose counts are clipped, wrap, repeat or lack codes.
     stood_still : mapping of int to float
-        Seconds for which a channel had a constant count though it has a signal otherwise, by
-        column; without channels that had none.
+        Seconds for which a channel had a constant count or a straight line though it has a signal
+        otherwise, by column; without channels that had none.
     diagnosis : Diagnosis or None
         None where there is too little to diagnose. While a recording grows it may be that of some
         segments before: it takes too long to be made for every snapshot.

@@ -217,7 +217,8 @@ class DiagnosticsBesides(TypedDict, total=False):
     ]
     wraps_at_bits: Annotated[Mapping[str, int], "Bits at which counts wrap, by affected channel."]
     stood_still_s: Annotated[
-        Mapping[str, float], "Seconds with a constant count, by affected channel."
+        Mapping[str, float],
+        "Seconds with a constant count or a straight line, by affected channel.",
     ]
 
 
