@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ from estimator.wording import clock_time, several
 from tui.output.csv_text import csv_text, safe_cell
 from tui.output.curves import CURVES
 from tui.page.table import Cell, Table
-from tui.wording.formatting import level, level_with_error, utc
+from tui.wording.formatting import is_known, level, level_with_error, utc
 
 if TYPE_CHECKING:
     from daq.estimation.snapshot import Snapshot
@@ -63,8 +64,10 @@ def averages_line(snapshot: Snapshot) -> str:
     """Return how many segments an estimate rests on."""
     text = (
         f"{several(snapshot.n_segments, 'segment')} ({snapshot.n_effective:.0f} effective averages)"
-        f" from {clock_time(snapshot.elapsed)} since {utc(snapshot.start_utc_ns)}"
+        f" from {clock_time(snapshot.elapsed)}"
     )
+    if is_known(datetime.fromtimestamp(snapshot.start_utc_ns * 1e-9, tz=UTC)):
+        text += f" since {utc(snapshot.start_utc_ns)}"
     if len(snapshot.octaves) > 1:
         text += f" above {snapshot.octaves[-1].low:.3g} Hz"
     return snapshot.caveats.nouns(text)

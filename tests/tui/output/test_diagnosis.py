@@ -19,7 +19,7 @@ from daq.results.result import Result
 from estimator.spectra.segment_rejection import Reason
 from tests.tui.example_snapshot import SETTINGS, STRANGER, advised, diagnosed, rotation, said
 from tui.output.diagnosis import details
-from tui.output.results import result_table
+from tui.output.results import averages_line, result_table
 from tui.page.terminal import terminal_table
 
 
@@ -86,6 +86,11 @@ def test_octaves_say_what_each_has_left_out() -> None:
     snapshot = replace(diagnosed(), octaves=octaves)
     text = " ".join(in_full(snapshot).split())
     assert "0–20 20 s 50 1 0 47 20.1–100 10 s 100 2 3 94" in text
+
+
+def test_samples_of_which_no_date_is_known_have_none() -> None:
+    dated = averages_line(diagnosed())
+    assert averages_line(replace(diagnosed(), start_utc_ns=0)) == dated.split(" since 2026-")[0]
 
 
 def test_a_sensor_elsewhere_has_no_noise_level() -> None:
