@@ -257,8 +257,9 @@ def _is_large_fall(advice: ResponseChanges) -> bool:
 def _remedy(advice: ResponseChanges) -> str:
     if _is_large_fall(advice):
         return "check its place and its cable"
-    varies = advice.is_turn or advice.band is not None
-    return "fix the sensor" if varies else "let the sensor settle"
+    if advice.is_turn or advice.band is not None:
+        return "fasten the sensor"
+    return "check its range and cable" if advice.begin == advice.end else "let the sensor settle"
 
 
 def _pairs(pairs: tuple[tuple[int, int], ...], names: Names) -> list[str]:
