@@ -84,7 +84,7 @@ SMALL = 0.05
 
 
 def changes(
-    stability: Stability, times: FloatArray | None, sensor_of: IntArray
+    stability: Stability | None, course: SegmentCourse | None, sensor_of: IntArray
 ) -> Iterator[Advice]:
     """Yield advice on changing responses, and on disturbed segments or else on changing noise.
 
@@ -92,11 +92,13 @@ def changes(
 
     Parameters
     ----------
-    stability : Stability
-    times : float64, shape (n_segments,), or None
-        Start times of the segments, s; None where no segment is disturbed.
+    stability : Stability or None
+    course : SegmentCourse or None
+        None where no segment is disturbed.
     sensor_of : int64, shape (n_channels,)
     """
+    if stability is None:
+        return
     for change in stability.changes:
         own = sensor_of == change.sensor
         yield ResponseChanges(
@@ -112,7 +114,7 @@ def changes(
             variance=float(stability.added[own].max()),
         )
     n_disturbed = len(stability.disturbed)
-    if n_disturbed and times is not None:
+    if n_disturbed and course is not None:
         excess = float(np.nan_to_num(stability.excess, nan=np.inf))
         rank = Rank.DELAYS if excess >= SMALL else Rank.TO_KNOW
         yield DisturbedSegments(
@@ -120,7 +122,7 @@ def changes(
             sensors=(int(sensor_of[stability.channel]),),
             n_disturbed=n_disturbed,
             n_segments=stability.n_segments,
-            times=tuple(times[stability.disturbed[:NAMED]].tolist()),
+            times=tuple(course.times[stability.disturbed[:NAMED]].tolist()),
             excess=stability.excess,
             channel=stability.channel,
         )
@@ -278,10 +280,6 @@ def diagnose(
     )
     there = presence(given, dims)
     part = given.part(list(there.channels))
-    condition = np.full((len(csm), len(pairs)), np.nan)
-    for one, two in combinations(range(len(there.sensors)), 2):
-        pair = pairs.index((there.sensors[one], there.sensors[two]))
-        condition[:, pair] = _condition(part.matrix, there.dims, one, two, given.valid)
     d = max(there.dims, default=max(dims))
     q = d if n_factors is None else n_factors
     maxima = maxima or Maxima()
@@ -303,11 +301,8 @@ def diagnose(
         neighbours=between,
     )
     tested = _without_lines(tested, lines)
-    snr, lost = np.full((2, len(csm), sum(dims)), np.nan)
-    if isinstance(fit, Maximum):
-        error = standard_error(fit, n_effective=n_effective)
-        snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), sum(dims))
-        lost = there.spread((error >= fit.psi).astype(np.float64), sum(dims))
+    condition = _conditions(part.matrix, there, pairs, given.valid)
+    snr, lost = _strength(fit, there, (len(csm), sum(dims)), n_effective)
     canonical = CanonicalCoherence(part.matrix, part.valid & (frequency > 0))
     dimension = significant_dimensions(canonical, there.dims, n_effective)
     found = tuple(
@@ -388,15 +383,7 @@ def diagnose(
             moved=left,
             further=(
                 *_lines(lines, frequency, there.sensors),
-                *(
-                    ()
-                    if steady is None
-                    else changes(
-                        steady,
-                        None if course is None else course.times,
-                        np.repeat(np.arange(len(dims)), dims),
-                    )
-                ),
+                *changes(steady, course, np.repeat(np.arange(len(dims)), dims)),
             ),
         ),
         stability=steady,
@@ -466,6 +453,28 @@ def _shared(
 def _least(values: FloatArray) -> FloatArray:
     """Return the smallest finite number of each row, shape (n_freqs,); NaN without one."""
     return np.asarray(np.fmin.reduce(values, axis=1), np.float64)
+
+
+def _strength(
+    fit: Maximum | Untested, there: PresentSensors, shape: tuple[int, int], n_effective: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the SNR, and 1 where noise is within its standard error of zero; NaN without a fit."""
+    if isinstance(fit, Untested):
+        return np.full(shape, np.nan), np.full(shape, np.nan)
+    error = standard_error(fit, n_effective=n_effective)
+    snr = there.spread(np.where(error < fit.psi, 1 / fit.psi - 1, np.nan), shape[1])
+    return snr, there.spread((error >= fit.psi).astype(np.float64), shape[1])
+
+
+def _conditions(
+    matrix: ComplexArray, there: PresentSensors, pairs: Sequence[tuple[int, int]], valid: BoolArray
+) -> FloatArray:
+    """Return the condition numbers of pairs of sensors, shape (n_freqs, n_pairs)."""
+    found = np.full((len(matrix), len(pairs)), np.nan)
+    for one, two in combinations(range(len(there.sensors)), 2):
+        pair = pairs.index((there.sensors[one], there.sensors[two]))
+        found[:, pair] = _condition(matrix, there.dims, one, two, valid)
+    return found
 
 
 def _condition(
