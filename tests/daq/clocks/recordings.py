@@ -120,7 +120,7 @@ def written(
     """Return a writer with all blocks of these sensors, changed; it is to be closed."""
     writer = create(path, sensors)
     for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
+        for block in blocks(name, sensor, 2.0):
             writer.append(change(block))
     return writer
 

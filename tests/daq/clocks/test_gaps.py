@@ -131,7 +131,7 @@ def test_a_sensor_that_never_sent_is_named_and_left_out(tmp_path: Path, names: s
     sensors = {name: FreeRunning(counts(3000, 3, ord(name))) for name in names}
     writer = create(tmp_path / "r.h5", sensors | {"D": FreeRunning(counts(1, 3, 1))})
     for name, sensor in sensors.items():
-        for block in blocks(name, sensor):
+        for block in blocks(name, sensor, 2.0):
             writer.append(block)
     writer.commit()
     with pytest.raises(NoResultError, match="no samples of D, and an estimate needs"):

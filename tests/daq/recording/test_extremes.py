@@ -96,10 +96,10 @@ def test_those_of_a_growing_recording_are_extended(tmp_path: Path) -> None:
 def test_a_damaged_block_has_no_extremes(path: Path) -> None:
     """Its samples are counted as missing, whatever stands there."""
     with h5py.File(path, "r+") as file:
-        file["sensors/A/samples"][120, 0] += 5
+        file["sensors/A/samples"][420, 0] += 5
         rows = file["sensors/A/blocks"][2:4]["first_row"].tolist()
     with Recording.open(path) as recording:
-        least, most = extremes_of(recording)[0].between(np.array([90, *rows, 160]))
+        least, most = extremes_of(recording)[0].between(np.array([390, *rows, 660]))
     assert np.isnan([least[1], most[1]]).all()
     assert np.isfinite([least[0], least[2]]).all()
 
