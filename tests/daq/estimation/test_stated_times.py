@@ -162,7 +162,7 @@ def test_a_broken_sensor_does_not_condemn_the_clock_that_it_shares_with_the_refe
 def test_what_is_said_of_times_is_that_of_all_recordings(tmp_path: Path) -> None:
     later = huddle(1e4, (0.0, 0.0, 0.0))
     for sensor in later.values():
-        sensor.start = 1000.0
+        sensor.start, sensor.counts = 1000.0, sensor.counts[:6000]
     drifting = write(tmp_path / "1.h5", huddle(1e4, PPM))
     snapshot = estimate([drifting, write(tmp_path / "2.h5", later)], SETTINGS)
     assert clock_facts(snapshot)[0].corrected["c"] == pytest.approx(276e-6, rel=0.05)
@@ -188,7 +188,7 @@ def test_stated_times_that_agree_with_the_motion_are_used_as_they_are(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("ppm", "every"), [(PPM, 6000), pytest.param((*PPM, 0.0), 600, marks=LONG)]
+    ("ppm", "every"), [(PPM, 8000), pytest.param((*PPM, 0.0), 600, marks=LONG)]
 )
 def test_drift_is_corrected_while_the_recording_grows(
     tmp_path: Path, ppm: tuple[float, ...], every: int
@@ -229,7 +229,7 @@ def drift(at: np.ndarray, late: np.ndarray, std: np.ndarray, *, nominal: bool = 
 
 def test_steady_delays_are_never_called_drifting() -> None:
     found = {
-        drift(*delays(seed), nominal=nominal) for seed in range(500) for nominal in (False, True)
+        drift(*delays(seed), nominal=nominal) for seed in range(250) for nominal in (False, True)
     }
     assert found == {0.0}
 
@@ -371,7 +371,7 @@ def delayed(counts: np.ndarray, n_samples: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("segment", [2.0, pytest.param(10.0, marks=LONG)])
-@pytest.mark.parametrize("n_samples", [0.01, 3.0, 17.0])
+@pytest.mark.parametrize("n_samples", [0.01, 17.0])
 def test_steps_of_any_size_are_looked_at_closely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_samples: float, segment: float
 ) -> None:

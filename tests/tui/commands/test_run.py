@@ -25,6 +25,8 @@ from tests.waiting import finish, wait_until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")
 
+SHORT = ("--duration", "6s", "--segment", "0.5s")
+
 
 def start(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
@@ -87,7 +89,7 @@ def test_a_result_that_cannot_be_written_elsewhere_is_in_the_recording(
     bench: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "r.h5"
-    wanted = ("--duration", "14s", "--out", str(out), "--json", "/dev/full")
+    wanted = (*SHORT, "--out", str(out), "--json", "/dev/full")
     assert "/dev/full" in huddle("run", str(bench), *wanted, code=3).stderr
     with Recording.open(out) as recording:
         assert recording.results()
@@ -126,11 +128,11 @@ def test_a_fault_of_the_estimate_does_not_end_the_recording(
 
     monkeypatch.setattr("daq.estimation.follow.follow", fail)
     out = tmp_path / "r.h5"
-    huddle("run", str(bench), "--duration", "14s", "--out", str(out))
+    huddle("run", str(bench), *SHORT, "--out", str(out))
     with Recording.open(out) as recording:
         assert recording.events[-1].text == "duration reached"
-        # Of 14 s: sensors of a busy computer connect late.
-        assert min(sensor.n_samples for sensor in recording.sensors) >= 10 * 190
+        # Of 6 s: sensors of a busy computer connect late.
+        assert min(sensor.n_samples for sensor in recording.sensors) >= 3 * 190
         assert recording.results()
 
 
