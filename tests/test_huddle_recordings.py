@@ -48,7 +48,7 @@ def test_a_recording_is_opened_read_and_estimated(tmp_path: Path) -> None:
 
 def test_files_are_estimated_as_their_import(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
-    motion = rng.normal(0, 1000, (30_000, 3))
+    motion = rng.normal(0, 1000, (10_000, 3))
     counts = {name: np.round(motion + rng.normal(0, 9, motion.shape)) for name in "ABC"}
     counts["B"] = counts["B"].astype(np.float64)
     counts["B"][700:750] = np.nan
@@ -63,13 +63,13 @@ def test_files_are_estimated_as_their_import(tmp_path: Path) -> None:
         for span in ({}, {"start": 6.5, "end": "8s"}, {"start": 7.2}, {"end": 7.1}, {"start": 900}):
             first, last = (
                 int(100 * float(str(span.get(key, value)).rstrip("s")))
-                for key, value in (("start", 0), ("end", 300))
+                for key, value in (("start", 0), ("end", 100))
             )
             for each in (recording, waveforms):
                 for name, array in counts.items():
                     found = each.samples(name, **span)
                     np.testing.assert_array_equal(found, array[first:last])
-    assert "A: 1 2 3 at 100 Hz, 30000 samples" in repr(waveforms)
+    assert "A: 1 2 3 at 100 Hz, 10000 samples" in repr(waveforms)
     assert waveforms.calibrations[0] == "A.1: 1 counts per counts (none)"
     frame = waveforms.to_frame("B", start=6, end=9)
     assert (frame.index[1] - frame.index[0]).total_seconds() == 1 / RATE
@@ -191,7 +191,7 @@ def test_a_plan_is_that_of_the_command(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("needs_obspy")
 def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     path = tmp_path / "fig9.h5"
-    huddle.simulate("fig9", duration="40s").write(path)
+    huddle.simulate("fig9", duration="15s").write(path)
     result = huddle.estimate(path, segment="1s")
     told = json.loads(command("calibrate", str(path), "--segment", "1s", "--json", "-"))
     found = huddle.calibrate(result)
@@ -233,7 +233,7 @@ def test_an_archive_answers_as_the_command(tmp_path: Path) -> None:
     folder = tmp_path / "runs"
     folder.mkdir()
     for seed in (1, 2):
-        huddle.simulate("fig9", duration="30s", seed=seed).write(folder / f"{seed}.h5")
+        huddle.simulate("fig9", duration="12s", seed=seed).write(folder / f"{seed}.h5")
     (folder / "broken.h5").write_bytes(b"no recording")
     ours = huddle.archive(folder, store=tmp_path / "ours", segment="1s")
     assert "broken.h5" in ours.problems[0]

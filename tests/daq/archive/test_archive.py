@@ -396,9 +396,9 @@ def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("reject", [False, True])
 def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool) -> None:
-    n, third = round(0.6 * 3600 * RATE), round(0.2 * 3600 * RATE)
-    path = record(tmp_path / "r.h5", hours=0.6, absent={"B": [(1, third, 2 * third)]})
-    other = record(tmp_path / "other.h5", hours=0.6, begin_ns=START_NS + 3 * HOUR_NS, seed=2)
+    n, third = round(0.3 * 3600 * RATE), round(0.1 * 3600 * RATE)
+    path = record(tmp_path / "r.h5", hours=0.3, absent={"B": [(1, third, 2 * third)]})
+    other = record(tmp_path / "other.h5", hours=0.3, begin_ns=START_NS + 3 * HOUR_NS, seed=2)
     store = store_for(tmp_path / "store", path, replace(SETTINGS, reject=reject))
     assert fill(store, [path, other]) == []
     for entries, _ in (store.entries(), store.entries()):  # from files, and from the index
@@ -416,11 +416,11 @@ def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool
 def test_a_sensor_that_shortens_recordings_is_named(tmp_path: Path) -> None:
     late = round(600 * RATE)
     paths = [
-        record(tmp_path / "a.h5", hours=0.6, late={"C": late}),
+        record(tmp_path / "a.h5", hours=0.4, late={"C": late}),
         record(
-            tmp_path / "b.h5", hours=0.6, begin_ns=START_NS + 3 * HOUR_NS, seed=2, late={"C": late}
+            tmp_path / "b.h5", hours=0.4, begin_ns=START_NS + 3 * HOUR_NS, seed=2, late={"C": late}
         ),
-        record(tmp_path / "c.h5", hours=0.6, begin_ns=START_NS + 6 * HOUR_NS, seed=3),
+        record(tmp_path / "c.h5", hours=0.4, begin_ns=START_NS + 6 * HOUR_NS, seed=3),
     ]
     store = store_for(tmp_path / "store", paths[0])
     assert fill(store, paths) == []

@@ -203,11 +203,11 @@ def equal_sensors() -> dict[str, Sensor]:
     }
 
 
-@pytest.mark.parametrize("window", ["hann", "rectangular"])
-def test_equal_sensors_are_left_alone(tmp_path: Path, window: str) -> None:
+def test_equal_sensors_are_left_alone_by_rectangular_windows(tmp_path: Path) -> None:
     path = write(tmp_path / "r.h5", equal_sensors())
     plain, automatic = (
-        estimate([path], replace(OFF, window=window, equalise=mode)) for mode in ("off", "auto")
+        estimate([path], replace(OFF, window="rectangular", equalise=mode))
+        for mode in ("off", "auto")
     )
     np.testing.assert_array_equal(plain.csm, automatic.csm)
 
@@ -238,7 +238,7 @@ def test_noise_by_which_no_filter_was_needed_is_not_estimated_again(
 ) -> None:
     path = write(tmp_path / "r.h5", equal_sensors())
     settings = replace(OFF, correct=correct)
-    again = estimate([path], settings).results["three-sensor"]
+    again = estimate([path], settings)
     estimated: list[str] = []
 
     def counted(method: str, *given: Any, **options: Any) -> SelfNoise:  # noqa: ANN401
@@ -247,10 +247,12 @@ def test_noise_by_which_no_filter_was_needed_is_not_estimated_again(
 
     for module in (equalisation, noise_estimates):
         monkeypatch.setattr(module, "self_noise", counted)
-    found = estimate([path], replace(settings, equalise="auto")).results["three-sensor"]
+    found = estimate([path], replace(settings, equalise="auto"))
     assert estimated == ["three-sensor"] * n_estimates
+    np.testing.assert_array_equal(found.csm, again.csm)
     for field in ("noise_psd", "cov", "low", "high", "flags"):
-        np.testing.assert_array_equal(getattr(found, field), getattr(again, field))
+        one, other = (getattr(e.results["three-sensor"], field) for e in (found, again))
+        np.testing.assert_array_equal(one, other)
 
 
 def test_segments_around_a_gap_are_left_out_as_far_as_filters_reach(tmp_path: Path) -> None:

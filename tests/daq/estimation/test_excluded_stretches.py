@@ -61,7 +61,6 @@ def recording(
 @pytest.mark.parametrize(
     ("options", "of_sensor"),
     [
-        ({"clocks": "nominal"}, {}),
         ({"clocks": "nominal"}, {"gaps": ((3500, 3520), (4500, 4505))}),
         ({"clocks": "nominal", "octaves": True}, {}),
         ({"clocks": "nominal", "reject": True}, {}),
