@@ -32,7 +32,6 @@ from daq.estimation.diagnosis import (
     synchronisation,
 )
 from daq.estimation.equalisation import METHOD, Equalisation
-from daq.estimation.freed_memory import LARGE, give_back
 from daq.estimation.linearity import linearised, nonlinear_channels
 from daq.estimation.noise_estimates import (
     Channels,
@@ -270,8 +269,6 @@ class SnapshotBuilder:
             shape = (len(frequency), first.n_channels, first.n_channels)
             csm = np.full(shape, np.nan, dtype=np.complex128)
         n_segments, n_unused = sum(each.n_segments for each in passes), 0
-        if is_large := final and csm.nbytes >= LARGE:
-            give_back()
         of_all, maxima = (bands, raw, recordings[0], first, n_segments), Maxima()
         estimates = self._estimates(*of_all, maxima=maxima, final=final, levels=bool(sets))
         if sets:
@@ -294,8 +291,6 @@ class SnapshotBuilder:
         nonlinear = (
             nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ()
         )
-        if is_large:
-            give_back()
         psd = np.diagonal(csm, axis1=1, axis2=2).real
         if final or (self._diagnoses.is_due and not left):
             with self._diagnoses:

@@ -52,7 +52,7 @@ from daq.estimation.freed_memory import reused
 def faults() -> int:
     before = getrusage(RUSAGE_SELF).ru_minflt
     for _ in range(20):
-        np.ones(2_000_000), np.ones(1_000_000)
+        np.ones(2_000_000), np.ones(5_000_000)
     return getrusage(RUSAGE_SELF).ru_minflt - before
 
 with reused():
@@ -64,7 +64,7 @@ print(faults())
 @pytest.mark.skipif(sys.platform != "linux", reason="its C library may keep no memory")
 def test_an_estimate_makes_arrays_in_the_memory_of_freed_ones() -> None:
     again, later = map(int, python(_ARRAYS_AGAIN).stdout.split())
-    pages = 20 * 24_000_000 // 4096
+    pages = 20 * 56_000_000 // 4096
     assert again < pages / 100 < pages / 20 < later  # some pages are large ones
 
 
