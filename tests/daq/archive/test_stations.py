@@ -147,15 +147,15 @@ def test_files_in_a_folder_are_as_good_as_sds(
 
 def test_grown_days_and_those_beside_them_are_taken_again(tmp_path: Path) -> None:
     root, store = tmp_path / "sds", tmp_path / "store"
-    write_station(root, days=2.2)
-    assert fill(f"sds://{root}", store)[1] == 3
+    write_station(root, days=1.2)
+    assert fill(f"sds://{root}", store)[1] == 2
     assert fill(f"sds://{root}", store)[1] == 0
     for location in ("00", "10", "20"):
         counts = np.arange(ROWS, dtype=np.int32)
-        append(root, "ABC", location, FIRST_NS + round(2.5 * DAY_NS), counts)
+        append(root, "ABC", location, FIRST_NS + round(1.5 * DAY_NS), counts)
     stores, n_days, failures = fill(f"sds://{root}", store)
     assert (n_days, failures) == (2, [])  # the segment at midnight is of both
-    assert len(stores["XX.ABC"].entries()[0]) == 3
+    assert len(stores["XX.ABC"].entries()[0]) == 2
 
 
 def test_days_without_all_channels_are_named_and_the_others_taken(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_a_response_may_change_at_midnight(tmp_path: Path) -> None:
     """And a day whose response has changed in the file is taken again, but no other."""
     obspy = pytest.importorskip("obspy")
     root, xml = tmp_path / "sds", tmp_path / "stations.xml"
-    write_station(root, days=2.0)
+    write_station(root, days=1.2)
     inventory = obspy.read_inventory()
     template = inventory[0][0][0]
     midnight = obspy.UTCDateTime((FIRST_NS + DAY_NS) // 10**9)

@@ -105,7 +105,7 @@ def test_rows_that_come_with_the_last_stored_ones_are_behind_the_gap(tmp_path: P
 def test_stored_rows_that_a_server_drains_are_no_gap(
     tmp_path: Path, stop: float, speed: float
 ) -> None:
-    logger = TextLogger(seconds=80.0)
+    logger = TextLogger(seconds=65.0)
     true, index, gaps, events = recorded(
         tmp_path / "r.h5", logger, logger.drained(15.0, 15.0 + stop, speed)
     )
@@ -126,7 +126,7 @@ def test_a_busy_host_and_an_odd_rate_make_no_gap(tmp_path: Path, ppm: float) -> 
 
 
 def test_two_stops_are_two_gaps_and_the_second_may_end_the_recording(tmp_path: Path) -> None:
-    logger = TextLogger(seconds=100.0)
+    logger = TextLogger(seconds=76.0)
     reads = [read for read in logger.rows() if not 30 <= read[1] < 35 and not 60 <= read[1] < 72]
     reads = [read for read in reads if read[1] < 75]
     true, index, gaps, _ = recorded(tmp_path / "r.h5", logger, reads)

@@ -188,16 +188,15 @@ def test_gusts_are_noise_that_changes_and_neither_disturbances_nor_responses(rat
     assert not kinds & {"disturbed-segments", "response-changes", "model-misfit"}
 
 
-@pytest.mark.parametrize("ratio", [0.05, 1.0])
-def test_noise_that_changes_is_told_from_weak_motion_that_fades(ratio: float) -> None:
+def test_noise_that_changes_is_told_from_weak_motion_that_fades() -> None:
     """No frequency by itself shows the directions of such motion."""
-    gusty = diagnosed(4, gusts=1.0, ratio=ratio)
+    gusty = diagnosed(4, gusts=1.0, ratio=0.05)
     assert gusty.stability is not None
     assert gusty.stability.inflation > 3
     kinds = {each.name for each in gusty.advice}
     assert "noise-changes" in kinds
     assert "model-misfit" not in kinds
-    fading = diagnosed(4, ratio=ratio, fade=0.1)
+    fading = diagnosed(4, ratio=0.05, fade=0.1)
     assert fading.stability is not None
     assert fading.stability.inflation < 1.2
     assert "noise-changes" not in {each.name for each in fading.advice}

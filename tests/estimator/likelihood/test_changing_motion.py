@@ -127,7 +127,7 @@ def test_intervals_hold_the_noise(d: int, snr: float) -> None:
 def test_steady_motion_is_refused() -> None:
     for d in (1, 3):
         for snr in (0.3, 30.0):
-            for bench in benches(5, draws=20, d=d, snr=snr):
+            for bench in benches(5, draws=10, d=d, snr=snr):
                 found = bench.estimate(bench.parts(np.zeros(N_PARTS)))
                 assert set(found.refusal) <= {Refusal.STEADY, Refusal.UNSETTLED}
                 assert np.isnan(found.level).all()

@@ -375,9 +375,9 @@ def test_passwords_do_not_cross_the_network_in_clear_text() -> None:
     Web.model_validate(table | {"certificate": "/a", "key": "/b"})
 
 
-def test_a_ledger_from_elsewhere_shows_no_other_file(server: Server, folder: Path) -> None:
-    ledger = Ledger(folder / "recordings" / "certificates")
-    run_id = json.loads(server.visit().get("/tests/night.h5/result.json").content)
+def test_a_ledger_from_elsewhere_shows_no_other_file(closed: Server) -> None:
+    ledger, visit = Ledger(closed.log.parent / "recordings" / "certificates"), closed.visit(READER)
+    run_id = json.loads(visit.get("/tests/night.h5/result.json").content)
     run = re.findall(r'"run_id": "(\w+)"', json.dumps(run_id))[0]
     with ledger.held():
         entry = ledger.allot(
@@ -389,10 +389,10 @@ def test_a_ledger_from_elsewhere_shows_no_other_file(server: Server, folder: Pat
             {"kind": "issued", "number": entry.number, "revision": 0, "at": "2026-01-01",
              "file": "../../cellar.toml", "sha256": "0" * 64}
         )  # fmt: skip
-    found = server.visit().get("/tests/night.h5/certificate/0")
+    found = visit.get("/tests/night.h5/certificate/0")
     assert b"sampling_rate = " not in found.content
     assert found.status == 409
-    page = server.visit().get("/tests/night.h5")
+    page = visit.get("/tests/night.h5")
     assert page.status == 200
     assert "is no row of a ledger" in page.text
 
@@ -400,16 +400,17 @@ def test_a_ledger_from_elsewhere_shows_no_other_file(server: Server, folder: Pat
 # ------------------------------------------------------------------------------- long work
 
 
-def test_abandoned_reports_hold_up_nobody(server: Server) -> None:
-    place = urlsplit(server.url)
-    sent = f"GET /tests/night.h5/report.pdf HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n"
+def test_abandoned_reports_hold_up_nobody(closed: Server) -> None:
+    place, visit = urlsplit(closed.url), closed.visit(READER)
+    sent = f"GET /tests/night.h5/report.pdf HTTP/1.1\r\nHost: {place.netloc}\r\n"
+    sent += f"Cookie: {visit.headers['Cookie']}\r\n\r\n"
     for _ in range(40):
         with socket.create_connection((place.hostname, place.port)) as left:
             left.sendall(sent.encode())
-    assert server.visit().get("/tests/night.h5").status == 200
-    first = server.visit().get("/tests/night.h5/report.pdf").content
+    assert visit.get("/tests/night.h5").status == 200
+    first = visit.get("/tests/night.h5/report.pdf").content
     assert first.startswith(b"%PDF-")
-    assert server.visit().get("/tests/night.h5/report.pdf").content == first  # kept
+    assert closed.visit(READER).get("/tests/night.h5/report.pdf").content == first  # kept
 
 
 class Busy:
