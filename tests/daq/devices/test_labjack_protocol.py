@@ -361,8 +361,7 @@ def test_a_packet_with_lost_bytes_does_not_shift_later_ones(timed: bool) -> None
     assert starts == [0, 10, 20, 30, 40, 50, *range(70, 200, 10)]  # the next one pays for it
 
 
-@pytest.mark.parametrize("jitter", [1, 4000])
-def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
+def test_a_timer_that_jitters_drops_no_scan() -> None:
     """Ticks of 25 ns, over more than two wraps: what was long ago is not what was just now."""
     rng = np.random.default_rng(1)
     receiver = decoder()
@@ -371,7 +370,7 @@ def test_a_timer_that_jitters_drops_no_scan(jitter: int) -> None:
     for k in range(n_packets):
         rows = scans(k * n_scans, n_scans)
         clock = rows[:, 0].astype(np.int64) | rows[:, 1].astype(np.int64) << 16
-        clock = (clock + rng.integers(-jitter, jitter, n_scans, endpoint=True)) % (1 << 32)
+        clock = (clock + rng.integers(-4000, 4000, n_scans, endpoint=True)) % (1 << 32)
         rows[:, 0], rows[:, 1] = clock & 0xFFFF, clock >> 16
         packet = encode_packet(Packet(rows.ravel()[:510], transaction=2 * k % 65536))
         rest = encode_packet(Packet(rows.ravel()[510:], transaction=(2 * k + 1) % 65536))

@@ -39,8 +39,7 @@ def test_bins_that_white_noise_shows_too_low_are_named(
     assert psd[max(lowest, 1) : -1] == pytest.approx(1.0, abs=5 / np.sqrt(n_segments))
 
 
-@pytest.mark.parametrize("detrend", ["constant", "linear"])
-@pytest.mark.parametrize("slope", [0.0, -0.5])
+@pytest.mark.parametrize(("detrend", "slope"), [("constant", -0.5), ("linear", 0.0)])
 def test_the_lowest_level_is_that_of_the_noise(detrend: str, slope: float) -> None:
     """White noise, and noise whose PSD falls with frequency, under ten times as much motion."""
     rng, n_samples = np.random.default_rng(7), 2000 * LENGTH

@@ -389,16 +389,6 @@ def test_another_laboratory_of_the_same_name_does_not_have_the_key(
     assert "no public key" in forged.lab.verify(path, "--key", forged.lab.bench, code=2)
 
 
-def test_an_unsigned_certificate_is_not_what_a_key_asks_for(
-    issued: Laboratory, signing: Signed
-) -> None:
-    said = issued.verify(issued.certificate())
-    assert "not signed: who can write the folder can write certificate and ledger anew" in said
-    assert f"recording {issued.recording}: the one certified, unchanged" in said  # it is beside
-    said = issued.verify(issued.certificate(), "--key", signing.public, code=3)
-    assert "it is not signed" in said
-
-
 def test_a_ledger_of_an_earlier_version_is_read_and_says_what_it_cannot_prove(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

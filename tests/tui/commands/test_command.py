@@ -190,7 +190,7 @@ def test_no_recording_is_written_under_the_name_of_another_format(
 
 def test_a_closed_pipe_is_no_failed_limit(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
-    printed("simulate", "fig9", "--duration", "2min", "--out", str(path))
+    printed("simulate", "fig9", "--duration", "40s", "--out", str(path))
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "wb") as pipe:  # noqa: PTH123 - a descriptor
@@ -233,7 +233,7 @@ def test_an_estimate_loads_no_more_than_it_needs(scenario: str, tmp_path: Path) 
     """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
     path = tmp_path / "short.h5"
     named = str(ROOT / scenario) if scenario.endswith(".toml") else scenario
-    printed("simulate", named, "--duration", "2min", "--out", str(path))
+    printed("simulate", named, "--duration", "40s", "--out", str(path))
     run = f"main(['estimate', {str(path)!r}])"
     loaded = modules_after(
         f"from tui.commands.main import main\ntry:\n    {run}\nexcept SystemExit:\n    print()"
