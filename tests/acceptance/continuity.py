@@ -23,16 +23,12 @@ from daq.protocols.block import BlockFlag, EventKind
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from tests.daq.clocks.recordings import Sensor, write
-from tests.daq.devices.test_stated_steps import (
-    SIGNED,
-    by_scream,
-    by_seedlink,
-    recorded,
-)
+from tests.daq.devices.test_stated_steps import by_scream, by_seedlink, recorded
 from tests.daq.devices.text.test_stated_steps import by_packets, by_rows
 from tests.peers.digitizer import Digitizer
 from tests.peers.text_logger import TextLogger
 
+SIGNED = [sign * size for size in (0.02, 0.3, 1.0, 20.0, 3600.0) for sign in (1, -1)]
 KINDS: dict[str, Callable[[Digitizer], list[Any]]] = {
     "SeedLink, numbers of a station": by_seedlink,
     "SeedLink, numbers of all stations": lambda one: by_seedlink(one, numbers=lambda n: 7 * n),
