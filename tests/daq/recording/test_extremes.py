@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from pathlib import Path
 
 import h5py
@@ -22,11 +23,16 @@ from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, 
 N_SAMPLES = 60 * BUCKET + 77
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    """Return a recording of two sensors."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sensors = {name: Sensor(counts(N_SAMPLES, 2, n), clock="one") for n, name in enumerate("AB")}
-    return write(tmp_path / "run.h5", sensors)
+    return write(tmp_path_factory.mktemp("made") / "run.h5", sensors)
+
+
+@pytest.fixture
+def path(made: Path, tmp_path: Path) -> Path:
+    """Return a recording of two sensors."""
+    return Path(shutil.copy(made, tmp_path))
 
 
 def brute(samples: NDArray[np.int32], edges: NDArray[np.int64]) -> NDArray[np.float64]:

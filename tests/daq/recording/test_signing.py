@@ -30,13 +30,20 @@ from tests.tui.service.test_continuations import record
 from tui.commands.main import app
 
 
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a folder with a key and a recording that is signed with it."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    record(folder / "r.h5", 2)
+    make_key(folder / "lab.key")
+    sign(folder / "r.h5", folder / "lab.key")
+    return folder
+
+
 @pytest.fixture
-def signed(tmp_path: Path) -> Path:
-    """Return a signed recording, beside ``lab.key``."""
-    record(tmp_path / "r.h5", 2)
-    make_key(tmp_path / "lab.key")
-    sign(tmp_path / "r.h5", tmp_path / "lab.key")
-    return tmp_path / "r.h5"
+def signed(laboratory: Path, tmp_path: Path) -> Path:
+    """Return a copy of the signed recording, beside ``lab.key``."""
+    return Path(shutil.copytree(laboratory, tmp_path, dirs_exist_ok=True)) / "r.h5"
 
 
 def verified(path: Path, *options: str) -> str:

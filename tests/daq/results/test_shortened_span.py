@@ -16,7 +16,7 @@ from estimator.checks.advice import Rank
 from tests.daq.clocks.recordings import Sensor, write
 
 SETTINGS = Settings(segment=2.0)
-RATE, SECONDS = 20.0, 1200.0
+RATE, SECONDS = 10.0, 1200.0
 
 
 def estimated(path: Path, *, begin: float = 0.0, end: float = SECONDS) -> Snapshot:
