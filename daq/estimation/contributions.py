@@ -11,7 +11,7 @@ import numpy as np
 from daq.bench.sensitivity import Sensitivities
 from daq.estimation.settings import DIMENSIONS
 from daq.estimation.snapshot import Snapshot, once
-from estimator.checks.advice import Rank
+from estimator.checks.advice import Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.advice_on_signals import NoSharedMotion
@@ -105,6 +105,8 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share))
+    if diagnostics.untested is Untested.TOO_FEW_AVERAGES and method != "multi-part":
+        found.append(contribution(Source.UNTESTED, shape, below=math.inf))
     found += [*_of_two(snapshot, method, psd), *_alone(snapshot, psd.shape)]
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)

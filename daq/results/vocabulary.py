@@ -102,6 +102,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.EDGES: "edges of segments",
     Source.GAPS: "gaps",
     Source.MISFIT: "motion that sensors do not share",
+    Source.UNTESTED: "a model that is not tested",
     Source.SHARED_NOISE: "shared noise",
     Source.AXES: "axes that may be off",
     Source.DIMENSIONS: "the number of dimensions",

@@ -59,7 +59,7 @@ class Comparison:
     `no_clocks` the ends without what the clocks do. NaN in bands without an estimate. `gains` has
     what the channel reads of the motion of the others, in place of 1; empty where the motion does
     not contradict its sensitivity. `reach` is how far the sensitivity, which no time improves,
-    moves the ends in logarithms of the noise.
+    moves the ends in logarithms of the noise, `least` the averages from which they are trusted.
     """
 
     centre: FloatArray
@@ -77,6 +77,7 @@ class Comparison:
     is_faulty: bool
     gains: tuple[float, ...] = ()
     reach: float = 0.0
+    least: float = MIN_AVERAGES
 
     def judged(self) -> Judged:
         """Return the verdict, and the band where the channel does worst."""
@@ -92,7 +93,7 @@ class Comparison:
         if not known.any():
             why = Obstacle.NO_ESTIMATE if self.centre.size else Obstacle.OUTSIDE_SPECTRUM
             return Judged(Verdict.NOT_DECIDED, None, why)
-        trusted = known & (self.averages >= MIN_AVERAGES) & ~self.is_alone
+        trusted = known & (self.averages >= self.least) & ~self.is_alone
         above = np.where(trusted, self.outer_low / self.mask, -math.inf)
         if above.max() > 1:
             return Judged(Verdict.FAIL, int(above.argmax()))
@@ -202,7 +203,7 @@ def prediction(
         quantile=quantile,
         elapsed=elapsed,
         averages=min(float(each.averages.min()) for each in found),
-        least=MIN_AVERAGES,
+        least=max(each.least for each in found),
     )
     starts = np.cumsum([0, *(each.centre.size for each in found)])
     at = int(np.searchsorted(starts, predicted.slowest, side="right")) - 1

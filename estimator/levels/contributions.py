@@ -37,6 +37,8 @@ class Source(enum.StrEnum):
     """The windows of segments with gaps leak from other frequencies."""
     MISFIT = "misfit"
     """One common motion does not explain the averages."""
+    UNTESTED = "untested"
+    """Whether one common motion explains the averages cannot be tested with so few."""
     SHARED_NOISE = "shared-noise"
     """Two channels share noise."""
     AXES = "axes"

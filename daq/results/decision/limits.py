@@ -34,7 +34,7 @@ from estimator.decision.comparison import (
     prediction,
     whole,
 )
-from estimator.decision.verdict import Obstacle
+from estimator.decision.verdict import MIN_AVERAGES, Obstacle
 from estimator.levels.contributions import Source, by_chance
 
 if TYPE_CHECKING:
@@ -265,6 +265,7 @@ class Bands:
             is_withdrawn=withdrawn,
             is_faulty=column in diagnostics.faulty,
             reach=reach,
+            least=max(MIN_AVERAGES, len(snapshot.channels) + 1.0),  # as the model test
         )
 
     def result(

@@ -24,7 +24,7 @@ _WHY_UNTESTED = {
     "there are none.",
     Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
     Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
-    "({channels}).",
+    "({channels}); until then, intervals have no lower end.",
     Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
     "few channels.",
     Untested.SINGULAR: "The model test is not possible: at no frequency is the cross-spectral "
@@ -72,7 +72,7 @@ class ModelUntested(Fact):
             n=self.n_effective, channels=self.n_channels, model=model(self.n_factors, self.dims)
         )
         do = "Record longer." if self.why is Untested.TOO_FEW_AVERAGES else ""
-        line = text.rstrip(".") + (": record longer" if do else "")
+        line = text.partition(";")[0].rstrip(".") + (": record longer" if do else "")
         return Words(line, text, do)
 
 

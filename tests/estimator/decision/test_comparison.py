@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimator.decision.comparison import Comparison, joint_quantile, mask_edges, prediction, whole
-from estimator.decision.verdict import Obstacle, Verdict
+from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
 
 QUANTILE = joint_quantile(3)
 
@@ -65,8 +65,9 @@ def test_what_the_sensitivity_may_be_must_not_change_the_verdict(gains: tuple[fl
 
 
 def test_few_averages_and_channels_without_partners_decide_nothing() -> None:
-    few = comparison(1.1, 2.0, averages=np.full(3, 19.0)).judged()
-    assert few.obstacle is Obstacle.TOO_FEW_AVERAGES
+    for averages, least in ((19.0, MIN_AVERAGES), (24.0, 25.0)):
+        few = comparison(1.1, 2.0, averages=np.full(3, averages), least=least).judged()
+        assert few.obstacle is Obstacle.TOO_FEW_AVERAGES
     alone = comparison(1.1, 2.0, is_alone=np.array([False, False, True])).judged()
     assert alone.obstacle is Obstacle.NO_SHARED_MOTION
     nothing = comparison(1.1, 2.0, mean=np.full(3, np.nan)).judged()
