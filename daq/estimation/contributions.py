@@ -37,6 +37,8 @@ SECOND_ORDER = 2.5
 UNTESTED = 0.2
 """What one dimension more took from the noise of six to eight sensors off plumb, or left in it, as
 a share, where they cannot test for it (docs/validation/levels.md)."""
+NOT_YET_TESTED = {Untested.TOO_FEW_AVERAGES, Untested.INCOMPLETE}
+"""Why the model is not tested, where another recording of the bench can be."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
@@ -105,7 +107,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share))
-    if diagnostics.untested is Untested.TOO_FEW_AVERAGES and method != "multi-part":
+    if diagnostics.untested in NOT_YET_TESTED and method != "multi-part":
         found.append(contribution(Source.UNTESTED, shape, below=math.inf))
     found += [*_of_two(snapshot, method, psd), *_alone(snapshot, psd.shape)]
     found += _by_motion_that_changes(snapshot, method, psd)

@@ -21,10 +21,10 @@ _WHY_UNTESTED = {
     Untested.UNFINISHED: "The diagnosis follows with the first segments.",
     Untested.NO_SEGMENTS: "The model test needs averages, and the recording has no segment.",
     Untested.INCOMPLETE: "The model test needs segments in which all channels have samples, and "
-    "there are none.",
+    "there are none; without it, intervals have no lower end.",
     Untested.TOO_FEW_SENSORS: "The model test needs three sensors with a signal of their own.",
     Untested.TOO_FEW_AVERAGES: "The model test needs more averages ({n:.0f} so far) than channels "
-    "({channels}); until then, intervals have no lower end.",
+    "({channels}); without it, intervals have no lower end.",
     Untested.TOO_FEW_CHANNELS: "The model test is not possible: {model} explains any signals of so "
     "few channels.",
     Untested.SINGULAR: "The model test is not possible: at no frequency is the cross-spectral "

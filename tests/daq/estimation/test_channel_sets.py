@@ -125,6 +125,7 @@ def test_segments_with_transients_are_left_out_of_every_set(octaves: bool) -> No
     off = deviations(snapshot)
     assert np.abs(off).max() < 4
     assert snapshot.diagnostics.untested is Untested.INCOMPLETE
+    assert np.nanmax(snapshot.results["three-sensor"].low) == -np.inf  # nothing is tested
     n_all = sum(snapshot.left_out.values())
     assert snapshot.left_out[Reason.TRANSIENT] >= 40
     assert snapshot.left_out[Reason.GAP] < 2 * N_PARTS
