@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from itertools import zip_longest
 
 import rich.table
+from rich.cells import cell_len
 from rich.text import Text
 
 from tui.page.blocks import Items, KeyValues
@@ -67,6 +69,16 @@ def terminal_table(
 def screen_table(table: Table, *, gap: int = 2, folded: Collection[str] = ()) -> rich.table.Table:
     """Return a table as the application shows it: rows are lines."""
     return terminal_table(table, header_style=SCREEN_HEADER, gap=gap, wraps=False, folded=folded)
+
+
+def fitting(table: Table, width: int, spare: Sequence[str], *, gap: int = 2) -> Table:
+    """Return a table without those of its columns `spare`, the first first, that have no room."""
+    for left_out in spare:
+        columns = zip_longest(table.header, *table.rows, fillvalue="")
+        if sum(gap + max(map(cell_len, column)) for column in columns) <= width:
+            break
+        table = table.with_columns([n for n, name in enumerate(table.header) if name != left_out])
+    return table
 
 
 def terminal_items(items: Items) -> rich.table.Table:

@@ -76,6 +76,26 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         await assert_looks_as_before(pilot, f"{name}-test-compared")
 
 
+async def test_a_narrow_screen_leaves_out_columns_and_cuts_no_names(told: ProgressCallback) -> None:
+    """A survey's channels were three times "XX.TST5.00.B…", and margins lacked their ends."""
+    async with opened(told, size=NARROW) as (app, pilot):
+        await shown(pilot, app, *running())
+        (status, estimate) = ended()
+        channels = tuple(
+            replace(each, sensor=f"XX.TST5.0{each.sensor}", channel=f"BH{each.channel}")
+            for each in estimate.result.snapshot.channels
+        )
+        snapshot = replace(estimate.result.snapshot, channels=channels)
+        found = replace(estimate, result=Result(snapshot, SETTINGS, demo_bench(LIMIT)))
+        await shown(pilot, app, status, found)
+        text = screen_text(app)
+    assert {f"XX.TST5.0{sensor}.BH{channel}" for sensor in "AB" for channel in "XYZ"} <= {
+        *text.split()
+    }
+    assert "margin, dB" in text
+    assert "worst c.o.v." not in text
+
+
 async def test_what_cannot_be_compared_says_why_and_c_ends_it(told: ProgressCallback) -> None:
     async with opened(told, size=WIDE) as (app, pilot):
         await at_result(pilot, app)

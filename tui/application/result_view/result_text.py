@@ -17,7 +17,7 @@ from tui.application.test_view.panels import alerts, known_to
 from tui.output.results import averages_line
 from tui.page import table as page
 from tui.page.table import Cell
-from tui.page.terminal import screen_table, styled, terminal_items
+from tui.page.terminal import fitting, screen_table, styled, terminal_items
 from tui.wording.facts import fact_items
 from tui.wording.formatting import level, level_with_error
 from tui.wording.verdict_text import (
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from tui.application.state import State
 
 MUTED, BAD = "#9aa5b8", "bold #ff6b6b"
-WIDE = 110  # columns from which there is room for what can be missed
+SPARE = ("data", "worst c.o.v.", "at", "from", "to")
+"""Columns that a narrow screen leaves out, the first first."""
 
 
 def result(state: State, *, width: int) -> RenderableType:
@@ -91,22 +92,19 @@ def _channels(state: State, result: Result, *, width: int) -> RenderableType:
     means = result.means(method)
     margins, differences = worst_by_channel(result.verdict), _differences(state)
     title = f"{method}, mean over {band[0]:.3g}–{band[1]:.3g} Hz, dB re 1 ({snapshot.unit})²/Hz"
-    is_wide, rows = width >= WIDE, []
-    is_full = is_wide or not (margins and differences)
-    titles = [*(["data"] if is_wide else []), "noise, 95 %", *(["worst c.o.v."] if is_full else [])]
-    titles += ["margin, dB", *(["at"] if is_full else [])] if margins else ["from", "to"]
+    rows = []
+    titles = ["channel", "data", "noise, 95 %", "worst c.o.v."]
+    titles += ["margin, dB", "at"] if margins else ["from", "to"]
     titles += [f"against {_reference(state)}"] if differences else []
     for column, label in enumerate(snapshot.channels):
-        name = Cell(label.name, strong=True)
-        recorded = [level(float(data[column]))] if is_wide else []
+        cells = [Cell(label.name, strong=True), level(float(data[column]))]
         if column in alone:
-            why = Cell(PARTNER_WORDS[alone[column]], "bad")
-            rows.append((name, *recorded, why))
+            cells.append(Cell(PARTNER_WORDS[alone[column]], "bad"))
+            rows.append((*cells, *[""] * (len(titles) - len(cells))))
             continue
         low, high = float(means[column].low[0]), float(means[column].high[0])
-        cells = [*recorded, level_with_error(float(means[column].mean[0]), high, low)]
-        if is_full:
-            cells.append("?" if math.isnan(cov[column]) else percent(cov[column]))
+        cells.append(level_with_error(float(means[column].mean[0]), high, low))
+        cells.append("?" if math.isnan(cov[column]) else percent(cov[column]))
         key = label.sensor, label.channel
         if not margins:
             cells += [level(low), level(high)]
@@ -114,13 +112,13 @@ def _channels(state: State, result: Result, *, width: int) -> RenderableType:
             worst = margins[key]
             words = f"{MARKS[worst.verdict]} {margin(worst)}".replace(" dB", "")
             cells.append(Cell(words, TONES[worst.verdict]))
-            cells += [f"{worst.frequency:.3g} Hz" if worst.known else ""] if is_full else []
+            cells.append(f"{worst.frequency:.3g} Hz" if worst.known else "")
         else:
-            cells += [Cell("no limit", "quiet"), *([""] if is_full else [])]
+            cells += [Cell("no limit", "quiet"), ""]
         if differences:
             cells.append(difference_cell(differences.get(key)))
-        rows.append((name, *cells))
-    return screen_table(page.Table(("channel", *titles), tuple(rows), title=title))
+        rows.append((*cells,))
+    return screen_table(fitting(page.Table((*titles,), (*rows,), title=title), width, SPARE))
 
 
 def _differences(state: State) -> dict[tuple[str, str], Difference]:

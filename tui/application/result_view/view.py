@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from textual.events import Resize
 
 
+_BESIDE = 5
+"""Columns beside the text: its margins, and what scrolls."""
 _MARGIN = 8
 """Columns beside a text in a dialog."""
 
@@ -82,7 +84,7 @@ class ResultView(View):
         if not state.has_result:
             words = "No result yet: a test has one when its recording has ended."
             return Text(state.trouble or state.note or words, MUTED)
-        return result(state, width=self.app.size.width)
+        return result(state, width=self.app.size.width - _BESIDE)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Offer only what can be done now."""
