@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from rich.cells import cell_len
 from rich.style import Style
 from rich.text import Text
 from textual.binding import Binding
@@ -66,9 +67,13 @@ class KeyLine(Widget):
         for _, binding, _, _ in self.screen.active_bindings.values():
             if binding.show:
                 shown.setdefault(binding.action, binding)
+        room = self.size.width + 1  # for a blank behind the last
+        keys = [(f" {self.app.get_key_display(each)} ", each) for each in shown.values()]
+        while len(keys) > 2 and sum(cell_len(k + e.description) + 1 for k, e in keys) > room:
+            del keys[-3:-2]  # help and how to leave are last
         self._ends.clear()
-        for binding in shown.values():
-            line.append(f" {self.app.get_key_display(binding)} ", key_style)
+        for key, binding in keys:
+            line.append(key, key_style)
             line.append(f"{binding.description} ")
             self._ends.append((line.cell_len, binding.key))
         return line
