@@ -20,6 +20,7 @@ from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench, m
 from tui.application.state import State
 from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.curves import level_limits, noise_curve
+from tui.application.test_view.plot import LevelAxis
 from tui.application.test_view.plotted import (
     Choice,
     curves,
@@ -66,6 +67,13 @@ def test_ticks_are_round_few_and_within(unit: SpectrumUnit, span: tuple[float, f
     for tick in ticks:
         digits = f"{abs(unit.value(tick)):.6e}"
         assert unit.is_db or digits[:3] in {"1.0", "2.0", "3.0", "5.0"}
+
+
+def test_labels_of_a_low_plot_are_on_rows_of_their_own() -> None:
+    """Seven rows beside a table of channels had nine labels: "−−95 dB"."""
+    axis = LevelAxis()
+    axis.rows = 6
+    assert axis.get_ticks(-120.0, -80.0) == [-120.0, -110.0, -100.0, -90.0, -80.0]
 
 
 def test_zoom_pan_and_cursor_stay_within_the_spectrum() -> None:

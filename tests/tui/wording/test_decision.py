@@ -133,6 +133,7 @@ def test_scatter_is_not_called_how_well_the_noise_is_known() -> None:
     """It said "known to 3.3 %" beside +1.35 −4.08 dB."""
     reached = Result(diagnosed(), SETTINGS).precision(0.05)
     assert known_to(reached).startswith("worst c.o.v. ")
+    assert known_to(replace(reached, cov=19.0)) == "worst c.o.v. above 1000 %, wanted 5 %"
 
 
 def test_a_test_that_lacks_a_sensor_is_not_decided_for_that_reason() -> None:

@@ -235,7 +235,7 @@ def known_to(reached: Precision) -> str:
     """
     wanted = "" if reached.target is None else f", wanted {percent(reached.target)}"
     if reached.cov > NOT_KNOWN_FROM:
-        return f"not known yet{wanted}"
+        return f"worst c.o.v. above {percent(NOT_KNOWN_FROM)}{wanted}"
     return f"worst c.o.v. {percent(reached.cov)}{wanted}"
 
 

@@ -14,7 +14,7 @@ from textual_plot.axis_formatter import AxisFormatter, NumericAxisFormatter
 
 from tui.application.test_view.braille import cells, joined
 from tui.application.test_view.curves import Curve, DrawnLine, level_limits
-from tui.application.test_view.units import SpectrumUnit, log_ticks
+from tui.application.test_view.units import MOST_TICKS, SpectrumUnit, log_ticks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,10 +49,11 @@ class LevelAxis(AxisFormatter):
     """Ticks at round values of a unit, on an axis in dB."""
 
     unit = SpectrumUnit("dB", is_db=True)
+    rows = 2 * MOST_TICKS
 
-    def get_ticks(self, min_: float, max_: float, max_ticks: int = 8) -> list[float]:
-        """Return tick positions in dB."""
-        return self.unit.ticks(min_, max_, max_ticks)
+    def get_ticks(self, min_: float, max_: float, max_ticks: int = MOST_TICKS) -> list[float]:
+        """Return tick positions in dB, no more than every other row has room for."""
+        return self.unit.ticks(min_, max_, min(max_ticks, (self.rows + 3) // 2))
 
     def get_labels_for_ticks(self, ticks: Sequence[float]) -> list[str]:
         """Return values in the unit."""
@@ -242,7 +243,7 @@ class PsdPlot(FullPlot):
         self.set_ylimits(low, high)
         if cursor is not None:
             self.add_v_line(cursor, "#e8edf6")
-        rows = max(4, self.size.height - self.margin_bottom - 2)
+        self._level_axis.rows = rows = max(4, self.size.height - self.margin_bottom - 2)
         dot = (high - low) / (rows * DOTS_PER_ROW)
         column = (last - first) / self.n_points
         for curve in curves:
