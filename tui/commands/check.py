@@ -96,8 +96,8 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
     ------
     BenchFileError
         With every error in the file.
-    ExceptionGroup
-        With a DeviceError for every port that failed, after the others have been shown.
+    typer.Exit
+        If ports failed, which the check list names, or a check fails.
     """
     from daq.devices.bench_file import caveats_of, load
     from daq.preflight.device_check import Examination
@@ -135,10 +135,8 @@ def check_bench(path: Path, *, devices: bool, write: bool = False, json: str | N
             "errors": [str(error) for error in examined.errors],
         },
     )
-    if examined.errors:
-        raise ExceptionGroup("devices in trouble", examined.errors)
-    if examined.failures:
-        raise typer.Exit(ExitCode.LIMIT_NOT_MET)
+    if examined.errors or examined.failures:
+        raise typer.Exit(ExitCode.TROUBLE if examined.errors else ExitCode.LIMIT_NOT_MET)
 
 
 def examined_bench(bench: Bench, *, duration: float | None = None) -> Examination:

@@ -277,7 +277,8 @@ async def keep_pages(path: Path, web: Web) -> None:
             server.terminate()
             await server.wait()
             raise
-        _LOGGER.warning("the pages ended with exit code %d; started again", code)
+        why = "; ".join(log.errors) or f"exit code {code}"
+        _LOGGER.warning("the pages ended: %s; started again in %g s", why, PAGES_AGAIN)
         await asyncio.sleep(PAGES_AGAIN)
 
 

@@ -425,7 +425,8 @@ def test_check_names_sensor_and_port_that_are_not_there(tmp_path: Path) -> None:
     bench.write_text(text, encoding="utf-8")
     result = huddle("check", str(bench), "--json", "-", code=3)
     for name, port in (("A", "tty0"), ("B", "tty1"), ("C", "tty2")):
-        assert any(name in line and port in line for line in result.stderr.splitlines())
+        (line,) = (line for line in result.stderr.splitlines() if port in line)  # once
+        assert f"'{name}'" in line
     assert len(json.loads(result.stdout)["errors"]) == 3
 
 

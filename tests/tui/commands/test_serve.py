@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from datetime import datetime, timedelta
@@ -15,14 +16,14 @@ import pytest
 
 from daq.bench.loading import dump
 from daq.bench.model import Bench
-from daq.bench.tables.unattended import Schedule, ScheduledRun
+from daq.bench.tables.unattended import Schedule, ScheduledRun, Web
 from daq.devices.bench_file import load, parse
 from daq.errors import BenchFileError, RecordingError
 from daq.recorder.schedule import utc_now
 from daq.recording.reader import Recording
 from tests.tui.demo_bench import DEMO
-from tests.waiting import limit
-from tui.commands.serve import AlreadyServedError, accepted, serve_runs
+from tests.waiting import limit, wait_until
+from tui.commands.serve import AlreadyServedError, accepted, keep_pages, serve_runs
 from tui.service.clock import SystemTime
 from tui.service.processes.locks import Lock
 from tui.service.processes.steps import ProcessSteps
@@ -140,3 +141,18 @@ def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
     assert again is not None
     again.release(remove=True)
     assert not service_lock(bench).exists()
+
+
+async def test_the_log_names_why_pages_end(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Pages of a service that was killed keep their port; the next service named an exit code."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        web = Web(port=taken.getsockname()[1])
+        path = tmp_path / "lab.toml"
+        path.write_text(f"{DEMO}[web]\nport = {web.port}\n", encoding="utf-8")
+        pages = asyncio.create_task(keep_pages(path, web))
+        await asyncio.to_thread(wait_until, lambda: "the pages ended" in caplog.text, "pages ended")
+        pages.cancel()
+        await asyncio.wait({pages})
+    assert f"{web.port}" in caplog.text.partition("the pages ended")[2]
