@@ -42,6 +42,8 @@ def why(error: BaseException) -> str:
     if isinstance(error, ssl.SSLError):  # its number is none of the system's
         return f"no encrypted connection: {error.reason or error}"
     number = getattr(error, "errno", None)
+    if number is None and "Inappropriate ioctl" in str(error):  # pyserial's, without its number
+        number = errno.ENOTTY
     if number in {errno.ENOENT, errno.ENODEV}:
         present = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
         return f"port does not exist; serial ports of this computer: {present}"

@@ -76,6 +76,8 @@ def status_lines(found: dict[str, Any]) -> Iterator[str]:
         )
         if recording["elapsed"] is not None:
             yield f"           {format_duration(round(recording['elapsed']))} are safe on disk"
+        if recording["reason"]:
+            yield f"           {recording['reason']}"
         for name, sensor in recording["sensors"].items():
             missing = f", {sensor['missing']} missing" if sensor["missing"] else ""
             yield f"  sensor   {name}: {sensor['state']}, {sensor['samples']} samples{missing}"
@@ -92,8 +94,8 @@ def status_lines(found: dict[str, Any]) -> Iterator[str]:
         yield f"{key + ' run':<10} {text}"
     disk = found["disk"]
     yield (
-        f"disk       {disk['free_bytes'] / 1e9:.1f} GB free; recordings end below"
-        f" {disk['min_free_bytes'] / 1e9:.1f} GB"
+        f"disk       {disk['free_bytes'] / 1e9:.3g} GB free; recordings end below"
+        f" {disk['min_free_bytes'] / 1e9:.3g} GB"
     )
     synchronised = {True: "synchronised", False: "NOT synchronised", None: "not known to be right"}
     yield f"clock      {found['clock']['utc']}, {synchronised[found['clock']['synchronised']]}"

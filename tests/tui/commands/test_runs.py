@@ -121,7 +121,8 @@ def test_verify_says_that_a_recording_is_not_closed(tmp_path: Path) -> None:
 def test_status_with_and_without_a_service(place: Path) -> None:
     recorded = Run("bench", "1", START + timedelta(hours=2), 60.0)
     recorded = recorded.to(RunState.RECORDING, started=recorded.due, parts=("a.h5",))
-    RunStore(place.parent / "recordings").save(recorded)
+    waiting = recorded.because("recording closed at 11 MB of free space")
+    RunStore(place.parent / "recordings").save(waiting)
     found = json.loads(printed("status", str(place), "--json", "-", code=3))
     validate("status-1", found)
     assert found["recording"]["ends"] == "2026-11-21T14:01:30Z"
@@ -136,6 +137,7 @@ def test_status_with_and_without_a_service(place: Path) -> None:
     text = printed("status", str(place))
     lock.release()
     assert "service    running" in text
+    assert "           recording closed at 11 MB of free space\n" in text
     assert "last run   1 of 2026-11-21T13:00:30Z: failed (=1+1)" in text
 
 
