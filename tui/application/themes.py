@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rich.segment import Segment
 from rich.style import Style
 from textual.app import App, SystemCommand
-from textual.filter import LineFilter, Monochrome
+from textual.filter import ANSIToTruecolor, LineFilter, Monochrome
 from textual.theme import Theme
 
 if TYPE_CHECKING:
@@ -181,8 +181,11 @@ class ThemedApp(App[Outcome]):
         filters = super().get_line_filters()
         if self._filters_for != (self.theme, filters):
             self._filters_for = self.theme, filters
+            few = self.console.color_system in {"standard", "windows"} and not self.is_headless
             shown = [
-                PlainMonochrome() if isinstance(each, Monochrome) else each for each in filters
+                PlainMonochrome() if isinstance(each, Monochrome) else each
+                for each in filters
+                if not (few and isinstance(each, ANSIToTruecolor))  # the nearest of 16 is another
             ]
             if self.theme == COLOUR_BLIND:  # before names of colours become numbers
                 shown.insert(0, SafeColours())

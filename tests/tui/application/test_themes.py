@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
+from rich.segment import Segment
+from rich.style import Style
+from textual.color import Color
 
 from daq.estimation.noise_estimates import ALL_METHODS
 from estimator.types import FloatArray
 from tests.tui.application.screen_text import screen_text
 from tests.tui.application.test_app import opened, running, shown
 from tests.tui.example_snapshot import ProgressCallback
+from tui.application.app import HuddleApp
 from tui.application.test_view.plotted import STYLES
 from tui.application.themes import COLOUR_BLIND, NO_COLOUR, SAFE, THEMES
 
@@ -89,3 +94,17 @@ async def test_themes_change_colours_and_nothing_else(tmp_path: Path) -> None:
     assert {SAFE[colour] for colour in ("#4cc9f0", "#ff6b6b")} <= drawn[COLOUR_BLIND]
     frame = "#c5c8c6"  # of the picture
     assert {c for c in drawn[NO_COLOUR] - {frame} if len({c[1:3], c[3:5], c[5:]}) > 1} == set()
+
+
+def test_a_terminal_of_16_colours_shows_its_own_red_and_yellow(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """FAIL was magenta there, and NOT DECIDED red: the nearest of 16 to the theme's colours."""
+    drawn = [Segment("NOT DECIDED", Style(color="yellow"))]
+    seen = []
+    for system in ("truecolor", "standard"):
+        monkeypatch.setattr(Console, "color_system", system)
+        (lines,) = HuddleApp(ProgressCallback(tmp_path / "run.h5")).get_line_filters()
+        (segment,) = lines.apply(drawn, Color(0, 0, 0))
+        seen.append(segment.style == drawn[0].style)
+    assert seen == [False, True]
