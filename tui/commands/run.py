@@ -287,11 +287,11 @@ class _Run:
 
     def segments(self, n_segments: int, elapsed: float) -> None:
         """Show the progress of the recording."""
-        from estimator.wording import clock_time
+        from estimator.wording import clock_time, percent
 
         parts = [f"{n_segments} segments"]
         if not math.isnan(self._cov):
-            parts.append(f"worst c.o.v. {self._cov:.3f}")
+            parts.append(f"worst c.o.v. {percent(self._cov)}")
         state = " · ".join([*parts, *filter(None, [self._left])])
         self._show(clock_time(elapsed), elapsed, self._end, state)
 

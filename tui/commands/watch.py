@@ -129,7 +129,7 @@ class _Lines:
 
 
 def _line(result: Result, now: RecordingStatus | None) -> str:
-    from estimator.wording import clock_time
+    from estimator.wording import clock_time, percent
     from tui.wording.verdict_text import how_long
 
     snapshot, state = result.snapshot, "ended"
@@ -137,7 +137,7 @@ def _line(result: Result, now: RecordingStatus | None) -> str:
         left = result.remaining(now.until, now.elapsed)
         state = how_long(left, now.in_local_time(left.seconds))
     cov = result.precision().cov
-    known = "" if math.isnan(cov) else f"worst c.o.v. {cov:.3f}  "
+    known = "" if math.isnan(cov) else f"worst c.o.v. {percent(cov)}  "
     return f"{clock_time(snapshot.elapsed)}  {snapshot.n_segments} segments  {known}{state}"
 
 

@@ -33,7 +33,7 @@ from tests.tui.example_snapshot import (
 )
 from tui.application.app import HuddleApp
 from tui.application.forms.estimate import as_changes
-from tui.application.messages import ReferenceReady, SensorsNoted, StatusUpdated
+from tui.application.messages import ReferenceReady, SensorsNoted, SnapshotReady, StatusUpdated
 from tui.application.reference import reference_of
 from tui.application.state import RECORDINGS, RESULT, Reference
 from tui.commands.tui_controls import save_result
@@ -80,14 +80,13 @@ async def test_a_narrow_screen_leaves_out_columns_and_cuts_no_names(told: Progre
     """A survey's channels were three times "XX.TST5.00.B…", and margins lacked their ends."""
     async with opened(told, size=NARROW) as (app, pilot):
         await shown(pilot, app, *running())
-        (status, estimate) = ended()
+        snapshot = made_snapshot(n_effective=2000, closed=True)
         channels = tuple(
             replace(each, sensor=f"XX.TST5.0{each.sensor}", channel=f"BH{each.channel}")
-            for each in estimate.result.snapshot.channels
+            for each in snapshot.channels
         )
-        snapshot = replace(estimate.result.snapshot, channels=channels)
-        found = replace(estimate, result=Result(snapshot, SETTINGS, demo_bench(LIMIT)))
-        await shown(pilot, app, status, found)
+        found = Result(replace(snapshot, channels=channels), SETTINGS, demo_bench(LIMIT))
+        await shown(pilot, app, ended()[0], SnapshotReady(found))
         text = screen_text(app)
     assert {f"XX.TST5.0{sensor}.BH{channel}" for sensor in "AB" for channel in "XYZ"} <= {
         *text.split()
