@@ -39,6 +39,10 @@ UNTESTED = 0.2
 a share, where they cannot test for it (docs/validation/levels.md)."""
 NOT_YET_TESTED = {Untested.TOO_FEW_AVERAGES, Untested.INCOMPLETE}
 """Why the model is not tested, where another recording of the bench can be."""
+FEW_AVERAGES = 20.0
+"""Averages up to which steadiness may not be tested beside any motion."""
+MUCH_MOTION = 10.0
+"""Motion over noise from which changes of a response count."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
@@ -107,7 +111,7 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
         above = taken if source is Source.SHARED_NOISE else 0.0
         if share.any() or np.any(above):
             found.append(contribution(source, shape, above=above, share=share))
-    if diagnostics.untested in NOT_YET_TESTED and method != "multi-part":
+    if is_untested(snapshot) and method != "multi-part":
         found.append(contribution(Source.UNTESTED, shape, below=math.inf))
     found += [*_of_two(snapshot, method, psd), *_alone(snapshot, psd.shape)]
     found += _by_motion_that_changes(snapshot, method, psd)
@@ -118,6 +122,16 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
+
+
+def is_untested(snapshot: Snapshot) -> bool:
+    """Return whether the model is not tested, or steadiness beside motion, for lack of averages."""
+    if snapshot.diagnostics.untested in NOT_YET_TESTED:
+        return True
+    found = snapshot.diagnostics.diagnosis
+    if found is None or found.stability is not None or snapshot.n_effective > FEW_AVERAGES:
+        return False
+    return any(bool((band.snr > MUCH_MOTION).any()) for band in found.bands)
 
 
 def _disturbed(snapshot: Snapshot) -> BoolArray:

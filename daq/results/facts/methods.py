@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from daq.estimation.contributions import is_untested
 from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.changes import facts_of_changes
@@ -44,7 +45,8 @@ _REMEDIES = {
 _NO_FLAG = Flag(0)
 
 
-ARCHIVES, TOO_LITTLE = "archives", "so few averages, or motion so weak"
+ARCHIVES, FEW = "archives", "so few averages"
+TOO_LITTLE = f"{FEW}, or motion so weak"
 """Causes of `SteadinessNotTested`."""
 
 
@@ -129,15 +131,28 @@ class SteadinessNotTested(Fact):
 
     In an archive, which keeps neither parts of time nor samples, linearity and the rounding that
     channels share are not tested either.
+
+    Attributes
+    ----------
+    causes : tuple of str
+    is_open : bool
+        Whether intervals have no lower end, as motion is strong and averages are few.
     """
 
     causes: tuple[str, ...]
+    is_open: bool
 
     def _words(self) -> Words:
-        text = f"whether noise or responses change is not tested with {listed(self.causes)}"
+        text = f"Whether noise or responses change is not tested with {listed(self.causes)}"
         if ARCHIVES in self.causes:
             text += "; neither are linearity, nor the rounding that channels share"
-        return Words(text, f"{text[0].upper()}{text[1:]}: the intervals hold for a steady bench.")
+        if self.is_open:
+            return Words(
+                "The test of steadiness needs more averages: record longer",
+                f"{text}: the intervals have no lower end.",
+                "Record longer.",
+            )
+        return Words(text, f"{text}: the intervals hold for a steady bench.")
 
 
 class LikeChannelsAssumed(Fact):
@@ -195,8 +210,11 @@ def facts_of_methods(snapshot: Snapshot) -> Iterator[Fact]:
         (ARCHIVES, not snapshot.sensors),  # of which no averages know
     )
     if found is not None and found.stability is None:
-        names = tuple(name for name, holds in causes if holds) or (TOO_LITTLE,)
-        yield SteadinessNotTested(rank=Rank.TO_KNOW, causes=names)
+        is_open = is_untested(snapshot)
+        names = tuple(name for name, holds in causes if holds) or (FEW if is_open else TOO_LITTLE,)
+        alone = is_open and snapshot.closed and snapshot.diagnostics.untested is None
+        rank = Rank.DELAYS if alone else Rank.TO_KNOW
+        yield SteadinessNotTested(rank=rank, causes=names, is_open=is_open)
     yield from facts_of_changes(snapshot)
     kept = _kept_within_parts(snapshot)
     if snapshot.results and not kept.all():

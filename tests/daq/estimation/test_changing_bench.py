@@ -141,6 +141,18 @@ def test_noise_is_at_most_what_is_found_until_the_model_can_be_tested() -> None:
     assert any("record longer" in fact.words.line for fact in result.facts)
 
 
+def test_noise_is_at_most_what_is_found_until_steadiness_can_be_tested() -> None:
+    """Eleven averages of nine channels, of which a gain steps by 5 %: 7 times, known to 5 %."""
+    snapshot = estimated("step", 6, n=round(33 * RATE))
+    result = Result(snapshot, Settings())
+    assert snapshot.diagnostics.untested is None
+    for mean in result.means("three-sensor", (1.0, 9.0)):
+        assert mean.low[0] <= NOISE <= mean.high[0]
+    assert "The test of steadiness needs more averages: record longer" in str(
+        [fact.words.line for fact in result.facts]
+    )
+
+
 def test_a_burst_of_the_motion_disturbs_no_quiet_sensor() -> None:
     rng = np.random.default_rng(4)
     motion = rng.standard_normal(N)

@@ -243,7 +243,7 @@ EXAMPLES: tuple[Fact, ...] = (
         part=0.94,
     ),
     SharedNoiseNotSearched(rank=Rank.TO_KNOW, n_channels=120, most=96),
-    SteadinessNotTested(rank=Rank.TO_KNOW, causes=("archives",)),
+    SteadinessNotTested(rank=Rank.TO_KNOW, causes=("archives",), is_open=False),
     FewerFrequencies(rank=Rank.TO_KNOW, n=303, n_frequencies=499),
     LikeChannelsAssumed(rank=Rank.TO_KNOW, method="two-channel"),
     DirectionsPooled(
