@@ -133,12 +133,16 @@ def exported(
 
     First it has what simulated sensors measured, and then what takes its place.
     """
+    of_simulated = huddle.estimate(simulated, segment="5s")
 
     @functools.cache
     def export(kind: str) -> Path:
         path = tmp_path_factory.mktemp(kind) / f"a.{kind}"
-        for source, is_simulated in ((simulated, True), (recording, False)):
-            command.huddle("export", source, "--format", kind, "-o", path, "--segment", "5s")
+        for is_simulated in (True, False):
+            if is_simulated:
+                huddle.export(of_simulated, path, kind=kind)
+            else:
+                command.huddle("export", recording, "--format", kind, "-o", path, "--segment", "5s")
             if kind == "uff58":
                 notes = {each["id5"].strip() for each in pyuff.UFF(str(path)).read_sets()}
                 assert notes == {"SIMULATED SENSORS" if is_simulated else "NONE"}

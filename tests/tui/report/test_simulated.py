@@ -38,7 +38,7 @@ def test_caveats_stay_what_they_are_in_files_and_words(caveats: Caveats) -> None
 @pytest.mark.usefixtures("empty_figures")
 def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> None:
     recording, out, page = tmp_path / "s.h5", tmp_path / "s.json", tmp_path / "s.html"
-    command.huddle("simulate", "fig4", "--duration", "40s", "--out", recording)
+    command.huddle("simulate", "fig4", "--duration", "20s", "--out", recording)
     shown = command.huddle("estimate", recording, "--segment", "2s", "--json", out)
     assert "simulated sensors" in shown.output
     assert json.loads(out.read_text(encoding="utf-8"))["recordings"][0]["simulated"] is True
@@ -50,7 +50,7 @@ def test_a_simulated_recording_says_so_wherever_it_is_shown(tmp_path: Path) -> N
 def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Path) -> None:
     pytest.importorskip("obspy")
     recording, out = tmp_path / "s.h5", tmp_path / "s.mseed"
-    command.huddle("simulate", "fig4", "--duration", "40s", "--out", recording)
+    command.huddle("simulate", "fig4", "--duration", "20s", "--out", recording)
     command.huddle("export", recording, "--format", "npz", "--segment", "2s")
     with np.load(recording.with_suffix(".npz")) as file:
         assert str(file["simulated"]) == "true"
@@ -67,7 +67,7 @@ def test_exports_and_imports_of_simulated_recordings_keep_the_mark(tmp_path: Pat
 
 def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
     recording, out = tmp_path / "s.h5", tmp_path / "a.json"
-    command.huddle("simulate", "fig4", "--duration", "2min", "--out", recording)
+    command.huddle("simulate", "fig4", "--duration", "40s", "--out", recording)
     options = ["--segment", "2s", "--json", str(out)]
     for _ in range(2):  # from the recording, and from the index alone
         shown = command.huddle("archive", recording, *options)
@@ -85,7 +85,7 @@ def test_an_archive_of_simulated_recordings_says_so(tmp_path: Path) -> None:
 
 
 def test_estimates_and_figures_of_simulated_samples_say_so() -> None:
-    simulation = huddle.simulate("fig4", duration="40s")
+    simulation = huddle.simulate("fig4", duration="20s")
     result = huddle.self_noise(simulation, fs=simulation.fs, sample_unit="m/s²", segment="2s")
     assert result.snapshot.caveats
     assert "simulated" in repr(result)
