@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from tui.application.controls import Controls
 
 HINTS = {
-    "operator": "Who does the test. It stands in the recording and in the report.",
+    "operator": "Who does the test. Recording and report name the operator.",
     "note": "What is special about this test. Recorded as a mark at its start.",
     "end": "3h: after this time · 5 %: when the c.o.v. is 5 % · decided: when the limits"
     " are · several: the first of them · empty: x stops it. The recorder sees to it: this"

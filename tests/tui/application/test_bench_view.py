@@ -159,6 +159,22 @@ async def test_the_ports_are_released_before_a_test_and_with_the_view(
         assert reading.is_over.wait(limit())
 
 
+async def test_reading_that_fails_is_not_shown_as_going_on(told: ProgressCallback) -> None:
+    """The line below said "reading the sensors", and "nothing wrong is seen" above it."""
+
+    def fails(show: Callable[[tuple[SensorPreview, ...]], None], ended: threading.Event) -> None:
+        show(SOUND)
+        del ended
+        raise OSError("no such bench")
+
+    told.sensors = fails
+    async with opened(told) as (app, pilot):
+        await pressed(pilot, app, "1", "p")
+        await app.workers.wait_for_complete()
+        await shown(pilot, app)
+        assert "reading the sensors" not in screen_text(app)
+
+
 async def test_reading_goes_on_under_help_and_after_a_dialog(told: ProgressCallback) -> None:
     async with live(told) as (app, pilot, reading):
         for opens in ("question_mark", "ctrl+p"):

@@ -316,6 +316,7 @@ class BenchView(View):
             preview(post, ended)
         except (HuddleError, OSError) as error:
             self.post_message(ErrorReported(str(error)))
+            self.call_later(lambda: self.action_preview() if self._ended is ended else None)
 
     @on(PreviewUpdated)
     def _on_preview(self, message: PreviewUpdated) -> None:

@@ -15,7 +15,7 @@ from tui.application.forms.form import Field, Form
 from tui.runs.first_bench import answers_in, with_answers, with_limits
 
 HINTS = {
-    "operator": "Who does the tests. It stands in recordings and reports.",
+    "operator": "Who does the tests. Recordings and reports name the operator.",
     "names": "A name for each sensor, in the order of the rows, such as: A B C.",
     "axes": "Where the channels of every sensor point to, such as: east north up. May be empty.",
     "limits": "Most noise: a data sheet (brochure.csv), a model"
