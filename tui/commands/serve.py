@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import signal
 import time
 from itertools import islice
@@ -17,7 +18,7 @@ import typer
 from daq.bench.durations import format_duration
 from daq.bench.option_fit import shortest_duration
 from daq.errors import BenchFileError, FileFault, HuddleError
-from daq.recorder.schedule import all_due, utc_now
+from daq.recorder.schedule import all_due, due_times, utc_now
 from tui.commands.options import command, with_estimate_options, with_logging
 from tui.output.console import for_people, write_json
 from tui.output.extras import require
@@ -30,13 +31,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from daq.bench.model import Bench
-    from daq.bench.tables.unattended import Web
+    from daq.bench.tables.unattended import ScheduledRun, Web
     from tui.service.clock import SystemTime
     from tui.service.records.run_state import Run
     from tui.service.service import Service
 
 PAGES_AGAIN = 10.0
 """Seconds until pages that have ended are served again."""
+LOOKED_AHEAD = 50
+"""Due times of an entry from which the time between its runs follows."""
 INTERVAL = 10.0
 """Seconds between two signs of life, at most."""
 _LOGGER = logging.getLogger(__name__)
@@ -163,6 +166,13 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
             )
         elif found < shortest:
             wrong = f"too short for an estimate; expected at least {format_duration(shortest)}"
+        elif entry.when_busy == "queue" and entry.longest is None:
+            apart = seconds_apart(entry)
+            wrong = (
+                f"longer than the {format_duration(apart)} between runs: the queue never ends"
+                if apart * bench.speed < found
+                else ""
+            )
         if wrong:
             faults.append(FileFault(key, wrong))
     if bench.metrics is not None:
@@ -172,6 +182,12 @@ def accepted(path: Path, wanted: Mapping[str, object]) -> Bench:
     if faults:
         raise BenchFileError(*faults, source=path)
     return bench
+
+
+def seconds_apart(entry: ScheduledRun) -> float:
+    """Return the mean time between due times of an entry, in s; infinite for a single one."""
+    times = list(islice(due_times(entry, utc_now()), LOOKED_AHEAD))
+    return math.inf if len(times) < 2 else (times[-1] - times[0]).total_seconds() / (len(times) - 1)
 
 
 async def serve_runs(

@@ -120,7 +120,12 @@ def test_a_schedule_without_a_usable_duration_is_a_fault_of_the_file(tmp_path: P
     path.write_text(
         DEMO.replace('duration = "5min"', "")
         + '[[schedule]]\nname = "a"\ncron = "0 1 * * *"\ntime_zone = "UTC"\n'
-        + '[[schedule]]\ncron = "0 1 * * *"\ntime_zone = "UTC"\nduration = "3s"\n',
+        + '[[schedule]]\ncron = "0 1 * * *"\ntime_zone = "UTC"\nduration = "3s"\n'
+        + "".join(
+            f'[[schedule]]\nname = "{name}"\ncron = "*/30 * * * *"\ntime_zone = "UTC"\n'
+            f'duration = "{duration}"\nwhen_busy = "queue"\n'
+            for name, duration in (("fits", "2h"), ("grows", "121min"))  # at four times real time
+        ),
         encoding="utf-8",
     )
     with pytest.raises(BenchFileError) as caught:
@@ -128,6 +133,8 @@ def test_a_schedule_without_a_usable_duration_is_a_fault_of_the_file(tmp_path: P
     said = str(caught.value)
     assert 'schedule["a"].duration: is missing' in said
     assert 'schedule["daily 01:00"].duration: too short' in said
+    assert 'schedule["grows"].duration: longer than the 30m between runs' in said
+    assert "fits" not in said
 
 
 def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
