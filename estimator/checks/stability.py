@@ -297,6 +297,14 @@ def _groups(averages: FloatArray, q: int, n_channels: int) -> tuple[list[IntArra
     return grouped(averages, max(q + MIN_DEGREES, float(averages.sum()) / FEW_PARTS)), True
 
 
+def _by_run(parts: Parts, q: int) -> list[IntArray]:
+    """Return the parts of each recording; nothing of one, or where one has too few averages."""
+    runs = np.array([each.run for each in parts.each])
+    found = [np.flatnonzero(runs == run) for run in sorted(set(runs.tolist()))]
+    enough = all(parts.averages[run].sum() > q + MIN_DEGREES for run in found)
+    return found if len(found) > 1 and enough else []
+
+
 FEW_PARTS = 4
 """Parts of a short recording, in which each has fewer averages than channels."""
 
@@ -350,19 +358,16 @@ def stability(
     groups, is_short = _groups(averages, q, maximum.psi.shape[1])
     if len(groups) < MIN_PARTS:
         return None
-    runs = np.array([each.run for each in parts.each])
-    by_run = [np.flatnonzero(runs == run) for run in sorted(set(runs.tolist()))]
-    several = len(by_run) > 1 and all(averages[run].sum() > q + MIN_DEGREES for run in by_run)
+    by_run = _by_run(parts, q)
     n_channels = maximum.psi.shape[1]
     begin, end = np.array([(parts.each[i[0]].begin, parts.each[i[-1]].end) for i in groups]).T
-    correlation = np.concatenate([[1.0], neighbours, [0.0]])
     of_bands = functools.partial(
         band_steadiness,
         parts,
         psd=psd,
         groups=groups,
-        by_run=by_run if several else [],
-        correlation=correlation,
+        by_run=by_run,
+        correlation=np.concatenate([[1.0], neighbours, [0.0]]),
         dims=dims,
     )
     some, whole = ([e[inside[parts.bins[e]]] for inside in insides] for e in (places, every))
@@ -382,15 +387,11 @@ def stability(
     changes, added = _changed(bands, dims, begin, end, doubtful=doubtful and suspect)
     low, high = np.array([frequency[inside][[0, -1]] for inside in insides]).T
     if suspect and not doubtful:
-        noise = [
-            median(maximum.psi[inside & good]) if (inside & good).any() else np.zeros(n_channels)
-            for inside in insides
-        ]
         changes, added = _also_by_band(
             (changes, added),
             bands,
             explained,
-            noise,
+            _usual_noise(maximum, [inside & good for inside in insides]),
             edges=(low, high),
             dims=dims,
             time=(begin, end),
@@ -435,7 +436,7 @@ def stability(
         parts=Scatter.of(levels, n_channels),
         runs=(
             Scatter.of([None if band is None else band.of_runs for band in bands], n_channels)
-            if several
+            if by_run
             else None
         ),
         inflations=np.array([1.0 if band is None else band.inflation for band in bands]),
@@ -451,6 +452,12 @@ def stability(
         loudness=loudness,
         steadied=() if without is None else (without,),
     )
+
+
+def _usual_noise(maximum: Maximum, insides: Sequence[BoolArray]) -> list[FloatArray]:
+    """Return the noise in the middle of bands as a share of the PSD, each (n_channels,)."""
+    nothing = np.zeros(maximum.psi.shape[1])
+    return [median(maximum.psi[inside]) if inside.any() else nothing for inside in insides]
 
 
 def _tested(maximum: Maximum, bins: IntArray, n_effective: float) -> tuple[BoolArray, bool]:
