@@ -167,7 +167,7 @@ def _record(path: Path, out: Path, settings: Settings, duration: float, speed: f
 
     notices().print(
         f"Recording three simulated accelerometers for {format_duration(duration)} at {speed:g} "
-        f"times real time, which takes {format_duration(duration / speed)}."
+        f"times real time, which takes at least {format_duration(duration / speed)}."
     )
     recorder = RecorderProcess(path, out, end=EndCondition(duration))
     try:
