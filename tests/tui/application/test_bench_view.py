@@ -103,7 +103,9 @@ async def test_limits_are_changed_in_a_form_also_those_of_a_file(tmp_path: Path)
     (tmp_path / "sheet.csv").write_text("frequency (Hz), noise (µg/√Hz)\n1, 3\n30, 2\n")
     bench = load(path)
     async with opened(BenchControls(path, bench, SETTINGS)) as (app, pilot):
-        await pressed(pilot, app, "l", "tab", "tab", *"sheet.csv")
+        said = await pressed(pilot, app, "l", "tab", "space", "u")
+        assert "directions for the 3 channels of A" in said
+        await pressed(pilot, app, "backspace", "backspace", "tab", *"sheet.csv")
         assert "decided, " in screen_text(app)
         await pilot.press("enter")
         await settled(pilot, app)
