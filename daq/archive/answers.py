@@ -47,6 +47,7 @@ from daq.archive.rollup import (
 from daq.archive.store import Store
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.blas_threads import one_blas_thread
+from daq.estimation.contributions import beside_stretches
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.recording.storage.refusals import check_all
@@ -307,7 +308,8 @@ def _write_totals(hdf5: WholeHdf5) -> None:
     for name in ("noise", "recorded"):
         total = reduce(add, (density_of(month[name]) for month in months))
         _write_density(hdf5, name, total)
-    hdf5.create("total", reduce(add, (month["total"][...] for month in months)))
+    for name in ("total", "alone", "alone_segments"):
+        hdf5.create(name, reduce(add, (month[name][...] for month in months)))
     hdf5.file.attrs["n_segments"] = sum(int(month.attrs["n_segments"]) for month in months)
 
 
@@ -334,6 +336,8 @@ class Answer:
         The estimate from all recordings together.
     method : str
         That of all but `result`.
+    between : float64, shape (n_channels,)
+        Share of the noise of `result`, in its band, that stretches estimated alone do not have.
     bands : tuple of (float, float)
         In Hz: the band of the estimate, then octaves, unless a band was asked for.
     days_utc_ns : int64, shape (n_days,)
@@ -361,6 +365,7 @@ class Answer:
 
     result: Result
     method: str
+    between: FloatArray
     bands: tuple[tuple[float, float], ...]
     days_utc_ns: IntArray
     n_segments: IntArray
@@ -435,9 +440,10 @@ def answer(
     ends = every.welch.lowest, usable
     tally = _Tally(years.grid, _bands(settings, years.grid.frequency, *ends))
     usual = _bands(plan.noise_settings(settings), years.grid.frequency, *ends)
-    pooled, lacking = Average(), Counter[int]()
+    pooled, lacking, alone = Average(), Counter[int](), np.zeros((2, 1, 1))
     for file in years.each([years.grid.span(band) for band in usual]):
         pooled.add_sum(spectra_file.unpacked(file["total"][...]), int(file.attrs["n_segments"]))
+        alone = alone + np.stack([file["alone"][...], file["alone_segments"][...]])
         tally.take(file)
     for entry in known:
         if entry.described.origin.run_id not in years.damaged:
@@ -450,6 +456,15 @@ def answer(
     if not tally.series:
         raise ArchiveError("\n".join(years.problems))
     snapshot = every.snapshot(pooled, diagnose=True)
+    method = judged_method(snapshot, plan.noise_settings(settings))
+    more = np.zeros(len(snapshot.channels))
+    if method in snapshot.results:
+        noise = years.grid.mean(snapshot.results[method].noise_psd)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            between = years.grid.more(noise, alone[0] / alone[1])
+            span = years.grid.span(tally.bands[0])
+            more = years.grid.average(between, [span])[0] / years.grid.average(noise, [span])[0]
+        snapshot = beside_stretches(snapshot, years.grid.at_bins(between))
     days = tally.of_all("days")
     levels = AnsweredLevels(*(tally.of_all(each.name) for each in fields(AnsweredLevels)))
     n_series = levels.mean.shape[1] * levels.mean.shape[2]
@@ -457,7 +472,8 @@ def answer(
     parts = {day: (n, total.reshape(3, n_series)) for day, (n, total) in tally.local.items()}
     return Answer(
         result=Result(snapshot, settings),
-        method=judged_method(snapshot, plan.noise_settings(settings)),
+        method=method,
+        between=more,
         bands=tally.bands,
         days_utc_ns=days,
         n_segments=tally.of_all("day_segments"),

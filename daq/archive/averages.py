@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from daq.archive.plan import Plan
     from daq.archive.spectra_file import Described
     from daq.bench.channel import Channel
+    from daq.bench.sensitivity import KnownSensitivity
     from daq.estimation.settings import Settings
 
     ComplexArray = NDArray[np.complex128]
@@ -176,6 +177,7 @@ class Estimator:
             diagnostics=diagnostics,
             across_axes=axes,
             rounding=ROUNDING if average.is_rounded else 0.0,
+            sensitivities=average.sensitivities,
             caveats=average.caveats,
             shortened=average.shortened,
         )
@@ -207,6 +209,7 @@ class Average:
         self.counts = CountLimits()
         self.stood_still: dict[int, float] = {}
         self.shortened: dict[str, tuple[float, float]] = {}
+        self.sensitivities: dict[tuple[str, str], KnownSensitivity] = {}
 
     def add(
         self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
@@ -228,6 +231,8 @@ class Average:
         self.usable = min(self.usable, described.usable)
         self.is_rounded |= described.rounded
         self.caveats = Caveats.joined([self.caveats, described.caveats])
+        for names, known in described.sensitivities.items():
+            self.sensitivities[names] = known.joined(self.sensitivities.get(names, known))
         for sensor, residual in described.residual.items():
             square = self._squares.get(sensor, 0.0)
             self._squares[sensor] = square + n_segments * residual**2

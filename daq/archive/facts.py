@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from daq.archive.changes import MIN_CONTRAST_DAYS, MIN_DAYS
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
-from estimator.wording import Words, listed, several
+from estimator.records import Share
+from estimator.wording import Words, few, listed, percent, several
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,6 +19,8 @@ if TYPE_CHECKING:
     from daq.archive.answers import Answer
 
 
+VARIES = 0.05
+"""Share of the noise, from which `ResponsesVary` is said."""
 _MOST_FILES = 8
 """Recordings that a sentence names."""
 
@@ -36,6 +41,27 @@ class RecordingsLeftOut(Fact):
             f"{count} left out: {clock} in {'it' if n == 1 else 'them'} ({files}).",
             "Check whether samples are lost or repeated without being counted (buffers, cable, the"
             " logger's software), and the sampling rate.",
+        )
+
+
+class ResponsesVary(Fact):
+    """Noise of `channels` from all spectra is more than that of stretches estimated alone.
+
+    Attributes
+    ----------
+    share : float
+        Part of the noise that these do not have, at most.
+    """
+
+    share: Share
+
+    def _words(self) -> Words:
+        much = f"up to {percent(self.share)} of it is motion"
+        return Words(
+            f"Responses change: noise of {few(list(self.channels))}, {much}; take that by day",
+            f"The noise of {listed(self.channels)} from all spectra together is more than that of"
+            f" stretches estimated alone: {much}, as responses change between them.",
+            "Take the noise by day, and let sensors settle.",
         )
 
 
@@ -127,6 +153,12 @@ def facts_of_archive(found: Answer) -> Iterator[Fact]:
             rank=Rank.DELAYS,
             sensors=tuple(sorted({one for each in found.doubted for one in each.not_understood})),
             recordings=tuple(each.origin.path for each in found.doubted),
+        )
+    if (varying := np.flatnonzero(found.between > VARIES)).size:
+        yield ResponsesVary(
+            rank=Rank.DELAYS,
+            channels=tuple(found.pooled.channels[column].name for column in varying),
+            share=float(found.between.max()),
         )
     if not any(each.decided for each in found.courses):
         n_days = len(found.days_utc_ns)

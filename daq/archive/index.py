@@ -14,6 +14,7 @@ from daq.archive.documents import Documents
 from daq.archive.rollup import month_of
 from daq.archive.spectra_file import Described, Origin, SpectraFile
 from daq.bench.channel import Channel
+from daq.bench.sensitivity import as_document, sensitivities_from
 from daq.caveats import Caveat, Caveats
 from daq.recording.file_format import channel_attributes, channels_of, plain
 from estimator.checks.count_limits import CountLimits
@@ -101,6 +102,7 @@ class Index:
                 shortened={k: (v[0], v[1]) for k, v in found.pop("shortened").items()},
                 not_understood=tuple(found.pop("not_understood")),
                 caveats=Caveats(map(Caveat, found.pop("caveats"))),
+                sensitivities=sensitivities_from(found.pop("sensitivities")),
                 **{name: found.pop(name) for name in PLAIN},
             )
             return IndexEntry(path, described, **found)
@@ -119,6 +121,7 @@ class Index:
         document = {each.name: getattr(described, each.name) for each in fields(described)} | {
             "origin": asdict(described.origin),
             "counts": asdict(described.counts),
+            "sensitivities": as_document(described.sensitivities),
             "channels": key,
             "start_utc_ns": entry.start_utc_ns,
             "n_segments": entry.n_segments,

@@ -25,7 +25,7 @@ from daq.archive.spectra_file import DAY_NS, Described, Summary
 from daq.results.band_summary import Levels, Spectrum, band_within, correlation_of
 from estimator.errors import BandError
 from estimator.levels.bands import BandLevels, band_edges
-from estimator.levels.contributions import Contribution, Source
+from estimator.levels.contributions import Contribution, Source, deviation
 from estimator.levels.interval import NORMAL_95, like_psd
 
 if TYPE_CHECKING:
@@ -114,6 +114,23 @@ class Grid:
         with np.errstate(invalid="ignore"):
             return np.asarray(np.where(number > 0, total / number, np.nan))
 
+    def more(self, noise: FloatArray, alone: FloatArray) -> FloatArray:
+        """Return what noise has over that of spectra estimated alone, by octave.
+
+        All of shape (n_fine, n_channels); where either is not known, none.
+        """
+        known = np.isfinite(noise) & np.isfinite(alone)
+        noise, apart = np.where(known, noise, 0.0), np.where(known, noise - alone, 0.0)
+        spans = [slice(k, k + PER_OCTAVE) for k in range(0, len(noise), PER_OCTAVE)]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = self.average(apart, spans) / self.average(noise, spans)
+        return np.nan_to_num(share).repeat(PER_OCTAVE, axis=0)[: len(noise)] * noise
+
+    def at_bins(self, fine: FloatArray) -> FloatArray:
+        """Return values of bands, of shape (n_fine, n_channels), at all frequencies."""
+        place = np.searchsorted(self.edges, np.arange(len(self.frequency)), side="right") - 1
+        return np.asarray(fine[np.clip(place, 0, len(fine) - 1)])
+
     def span(self, band: tuple[float, float]) -> slice:
         """Return the bands within a band in Hz, whose ends move to the nearest edges.
 
@@ -139,7 +156,7 @@ class Grid:
         """Return whether the ends of a band are edges."""
         return bool(np.isin(band_edges(self.frequency, band), self.edges).all())
 
-    def average(self, psd: SmallArray, spans: Sequence[slice]) -> FloatArray:
+    def average(self, psd: FloatArray | SmallArray, spans: Sequence[slice]) -> FloatArray:
         """Return means over the known bands of `spans`, of (…, n_fine, n_channels)."""
         known = np.isfinite(psd)
         weight = known * self.n_bins[:, None].astype(np.float64)
@@ -332,12 +349,21 @@ class _Making:
             row[BELOW] = sum((each.below for each in found.contributions), np.zeros(shape))
             row[ABOVE] = sum((each.above for each in found.contributions), np.zeros(shape))
             row[SHARE] = sum((each.share for each in found.contributions), np.zeros(shape))
-            if (loudness := snapshot.diagnostics.loudness) is not None:
-                row[SHARE] += NORMAL_95 * loudness.deviation
+            row[SHARE] += NORMAL_95 * deviation(found.contributions)
+            more = self._more_than_alone(grid.mean(result.noise_psd))
+            row[BELOW] += np.maximum(more, 0.0)
+            row[ABOVE] += np.maximum(-more, 0.0)
             row[BOUND] = np.where(found.bound.complete, found.bound.mean, np.nan)
             row[BOUND_DEVIATION] = np.where(found.bound.complete, found.bound.spread, np.nan)
         self._days.append((self._begin, self._day.n_segments, row))
         self._day = Average()
+
+    def _more_than_alone(self, noise: FloatArray) -> FloatArray:
+        """Return what the noise of the day has over that of its stretches, each estimated alone."""
+        own = [each for each in self._stretches if each[0] >= self._begin]
+        total, count = summed(np.stack([o[2] for o in own]), np.array([o[1] for o in own]))
+        with np.errstate(invalid="ignore"):
+            return self._grid.more(noise, total / count)
 
     def made(self) -> Summary:
         """Return the summary."""
@@ -370,6 +396,8 @@ class Rollup:
         Segments of each part of the day (`WORK`, `EARLY`, `LATE`).
     part_noise : float32, shape (n_local, 3, n_fine, n_channels)
     noise, recorded : Density
+    alone, alone_segments : float64, shape (n_fine, n_channels)
+        Noise of stretches, each estimated alone, times their segments; and these segments.
     total : complex128
         In the units of the archive's first recording.
     n_segments : int
@@ -384,6 +412,8 @@ class Rollup:
     part_noise: SmallArray
     noise: Density
     recorded: Density
+    alone: FloatArray
+    alone_segments: FloatArray
     total: ComplexArray
     n_segments: int
 
@@ -490,6 +520,12 @@ def rolled_up(
         segments[row] = local[ordinal][0]
         with np.errstate(invalid="ignore", divide="ignore"):
             parts[row] = local[ordinal][1] / segments[row][:, None, None]
+    alone = [
+        summed(each.noise, each.n_segments)
+        if len(each.starts)
+        else summed(each.levels[MEAN], each.day_segments)
+        for each in found
+    ]
     return Rollup(
         days=days,
         day_segments=day_segments,
@@ -499,9 +535,20 @@ def rolled_up(
         part_noise=parts.astype(np.float32),
         noise=noise,
         recorded=recorded,
+        alone=np.sum([noise for noise, _ in alone], axis=0),
+        alone_segments=np.sum([count for _, count in alone], axis=0),
         total=np.sum([each.total for each in found], axis=0),
         n_segments=int(sum(each.day_segments.sum() for each in found)),
     )
+
+
+def summed(noise: FloatArray | SmallArray, n_segments: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return noise of several spectra times their segments, summed, and the segments of the known.
+
+    Both of shape (n_fine, n_channels), from (n, n_fine, n_channels).
+    """
+    weight = np.isfinite(noise) * n_segments[:, None, None].astype(np.float64)
+    return (np.nan_to_num(noise) * weight).sum(axis=0), weight.sum(axis=0)
 
 
 def _counted_too(

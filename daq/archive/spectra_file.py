@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.bench.channel import Channel
+from daq.bench.sensitivity import Sensitivities, as_document, sensitivities_from
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.recording.file_format import channel_attributes, channels_of
@@ -42,7 +43,7 @@ SmallArray = NDArray[np.float32]
 FORMAT = "huddle-archive-spectra"
 FORMAT_VERSION = 2
 """1: without summaries."""
-SUMMARY_VERSION = 2
+SUMMARY_VERSION = 3
 """Summaries of another version are made again."""
 DAY_NS = 86400 * 10**9
 STRETCH_DTYPE = np.dtype([("start_utc_ns", "<i8"), ("n_segments", "<i8")])
@@ -104,7 +105,7 @@ class Described:
     lacking : mapping of int to int
         Segments that other channels have and a channel lacks, by its column: they are not kept.
     shortened : mapping of str to (float, float)
-        As in `daq.estimation.snapshot.Snapshot`.
+        As in `daq.estimation.snapshot.Snapshot`, and `sensitivities`.
     rounded : bool
         Whether estimates are made of matrices that were kept in single precision.
     caveats : Caveats
@@ -122,6 +123,7 @@ class Described:
     stood_still: Mapping[int, float] = field(default_factory=dict)
     lacking: Mapping[int, int] = field(default_factory=dict)
     shortened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    sensitivities: Sensitivities = field(default_factory=dict)
     rounded: bool = False
     caveats: Caveats = NO_CAVEATS
 
@@ -278,6 +280,7 @@ class SpectraWriter:
                 **{key: int(holds) for key, holds in described.caveats.keys.items()},
                 "lacking": json.dumps(dict(described.lacking)),
                 "shortened": json.dumps(dict(described.shortened)),
+                "sensitivities": json.dumps(as_document(described.sensitivities)),
                 "daily": int(self._daily),
                 "single": int(self._single),
             }
@@ -358,6 +361,7 @@ class SpectraFile:
                 sensor: (float(late), float(early))
                 for sensor, (late, early) in _table(attributes, "shortened", optional=True).items()
             },
+            sensitivities=sensitivities_from(json.loads(attributes.get("sensitivities", "[]"))),
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))

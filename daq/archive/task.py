@@ -39,6 +39,7 @@ from daq.estimation.noise_estimates import responses
 from daq.estimation.segments.clipping import limits_by_column
 from daq.estimation.segments.segment_pass import Pass, still_for_a_while
 from daq.estimation.settings import check_fit
+from daq.estimation.snapshot_builder import stated_sensitivities
 from daq.recording.interface import ReadableRecording
 from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
@@ -218,6 +219,7 @@ def _written(
             caveats=recording.caveats,
             lacking=each.sets.lacking(each.n_channels),
             shortened=each.aligned.shortened,
+            sensitivities=stated_sensitivities([recording]),
         )
         writer.commit(
             described, summaries(writer.rows(), described, plan, plan.noise_settings(settings))

@@ -8,8 +8,8 @@ distribution (JCGM 100:2008, 4.3.7).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
 from typing import Any, TypeAlias
 
 from estimator.records import dataclass
@@ -65,6 +65,15 @@ class KnownSensitivity:
         """Relative standard uncertainty by all causes."""
         return math.hypot(self.own, self.by_temperature)
 
+    def joined(self, other: KnownSensitivity) -> KnownSensitivity:
+        """Return what both allow."""
+        ends = (*self.temperatures, *other.temperatures)
+        return replace(
+            max(self, other, key=lambda each: each.own),
+            coefficient=max(self.coefficient, other.coefficient),
+            temperatures=(min(ends), max(ends)),
+        )
+
     def at(self, readings: tuple[float, float] | None) -> KnownSensitivity:
         """Return it at the lowest and highest temperature that was read; None: none was."""
         return self if readings is None else replace(self, temperatures=readings)
@@ -72,6 +81,19 @@ class KnownSensitivity:
 
 Sensitivities: TypeAlias = Mapping[tuple[str, str], KnownSensitivity]
 """By names of sensor and channel."""
+
+
+def as_document(known: Sensitivities) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return sensitivities as JSON has them."""
+    return [(*names, asdict(each)) for names, each in known.items()]
+
+
+def sensitivities_from(document: Iterable[Any]) -> Sensitivities:
+    """Return the sensitivities of a document."""
+    return {
+        (sensor, channel): KnownSensitivity(**each | {"temperatures": tuple(each["temperatures"])})
+        for sensor, channel, each in document
+    }
 
 
 def known_sensitivities(table: Mapping[str, Any]) -> Sensitivities:

@@ -213,6 +213,9 @@ def _gusts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]
 
 def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     """Return what responses that change leave of the motion in the noise."""
+    if (more := snapshot.between) is not None:
+        below, above = np.maximum(more, 0.0), np.maximum(-more, 0.0)
+        return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
     if steady is None:
@@ -271,11 +274,20 @@ def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> l
 
 def with_sensitivities(snapshot: Snapshot, sensitivities: Sensitivities) -> Snapshot:
     """Return a finished snapshot with other knowledge of the sensitivities, in all intervals."""
+    return _anew(replace(snapshot, sensitivities=sensitivities))
+
+
+def beside_stretches(snapshot: Snapshot, between: FloatArray) -> Snapshot:
+    """Return a finished snapshot with `Snapshot.between`, in all intervals."""
+    return _anew(replace(snapshot, between=between))
+
+
+def _anew(snapshot: Snapshot) -> Snapshot:
     results = {
         name: SelfNoise.of(name, each.noise_psd, each.cumulants, each.flags)
         for name, each in snapshot.results.items()
     }
-    return _widened(replace(snapshot, results=results, sensitivities=sensitivities))
+    return _widened(replace(snapshot, results=results))
 
 
 def with_contributions(snapshot: Snapshot) -> Snapshot:

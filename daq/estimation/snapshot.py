@@ -263,6 +263,8 @@ class Snapshot:
         may be off; empty: not at all.
     rounding : float
         Share of the data's PSD by which the noise may be off, because cross-spectra were rounded.
+    between : float64, shape (n_freqs, n_channels), or None
+        What the noise of an archive has, in unit**2/Hz, over that of stretches estimated alone.
     sensitivities : mapping of (str, str) to KnownSensitivity
         What is known of sensitivities, by names of sensor and channel; not in it: nothing.
     caveats : Caveats
@@ -309,6 +311,7 @@ class Snapshot:
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0
+    between: FloatArray | None = None
     sensitivities: Sensitivities = field(default_factory=dict)
     caveats: Caveats = NO_CAVEATS
     channel_segments: tuple[int, ...] = ()

@@ -358,7 +358,7 @@ class SnapshotBuilder:
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,
             across_axes=self._axes,
-            sensitivities=_sensitivities(recordings),
+            sensitivities=stated_sensitivities(recordings),
             caveats=Caveats.joined(recording.caveats for recording in recordings),
             quantisation_psd=(
                 quantisation_psd(frequency, channels, self._unit, counting) if final else None
@@ -669,7 +669,8 @@ def sensitivities_at(known: Sensitivities, readings: Iterable[Reading]) -> Sensi
     return {name: each.at(ends.get(name[0])) for name, each in known.items()}
 
 
-def _sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitivities:
+def stated_sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitivities:
+    """Return what is known of the sensitivities of recordings, by the bench of the first."""
     outline = recordings[0].outline
     if outline is None:
         return {}

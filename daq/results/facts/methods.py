@@ -129,8 +129,8 @@ class SharedNoiseNotSearched(Fact):
 class SteadinessNotTested(Fact):
     """Whether noise and responses change during the recording is not tested; `causes` are why.
 
-    In an archive, which keeps neither parts of time nor samples, linearity and the rounding that
-    channels share are not tested either.
+    In an archive, which keeps neither parts of stretches nor samples, linearity and the rounding
+    that channels share are not tested either.
 
     Attributes
     ----------
@@ -143,9 +143,10 @@ class SteadinessNotTested(Fact):
     is_open: bool
 
     def _words(self) -> Words:
-        text = f"Whether noise or responses change is not tested with {listed(self.causes)}"
+        what = "Whether noise or responses change is not tested"
         if ARCHIVES in self.causes:
-            text += "; neither are linearity, nor the rounding that channels share"
+            what = "Linearity, shared rounding, and changes within stretches are not tested"
+        text = f"{what} with {listed(self.causes)}"
         if self.is_open:
             return Words(
                 "The test of steadiness needs more averages: record longer",

@@ -11,6 +11,7 @@ from daq.archive.facts import (
     ChangesUndecided,
     NightsNotCompared,
     RecordingsLeftOut,
+    ResponsesVary,
     SpectraUnreadable,
     StretchesLeftOut,
 )
@@ -276,6 +277,7 @@ EXAMPLES: tuple[Fact, ...] = (
     SensorClipping(rank=Rank.DELAYS, sensors=A, are_kept=False),
     RecordingsLeftOut(rank=Rank.DELAYS, sensors=A, recordings=("/archive/night.h5",)),
     SpectraUnreadable(rank=Rank.DELAYS, files=("Damaged.",)),
+    ResponsesVary(rank=Rank.DELAYS, channels=("A.X", "A.Y"), share=0.86),
     ChangesUndecided(rank=Rank.DELAYS, n_days=2, needed=8),
     AbsencesNotUsed(rank=Rank.TO_KNOW, channels=("A.X", "B.Y"), n_segments=(120, 40)),
     StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=6),
