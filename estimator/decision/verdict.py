@@ -29,6 +29,8 @@ class Obstacle(enum.StrEnum):
     """The recording has no whole segment without gaps."""
     NO_ESTIMATE = "no-estimate"
     """The method that judges gives no noise for the channel in a band of the limit."""
+    NO_CHANNEL = "no-channel"
+    """The recording has none of the channels that a limit is for."""
     OUTSIDE_SPECTRUM = "outside-spectrum"
     """The limit has no frequency in common with the spectrum."""
     NO_SHARED_MOTION = "no-shared-motion"

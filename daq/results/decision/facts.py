@@ -24,6 +24,10 @@ _OBSTACLES: Mapping[Obstacle, tuple[str, str]] = {
         "{channels}: no estimate in a part of the limit",
         "Follow the advice on what is missing, and record again.",
     ),
+    Obstacle.NO_CHANNEL: (
+        "The recording has no channel that one of {limits} is for",
+        "Correct its sensors and channels in the bench file.",
+    ),
     Obstacle.OUTSIDE_SPECTRUM: (
         "The spectrum has no frequency of {limits}",
         "Use longer segments or another sampling rate.",

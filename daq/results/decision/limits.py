@@ -34,7 +34,7 @@ from estimator.decision.comparison import (
     prediction,
     whole,
 )
-from estimator.decision.verdict import MIN_AVERAGES, Obstacle
+from estimator.decision.verdict import MIN_AVERAGES, Obstacle, Verdict
 from estimator.levels.contributions import Source, by_chance
 
 if TYPE_CHECKING:
@@ -80,9 +80,14 @@ def judge(bench: Bench | None, estimate: Estimate) -> TestVerdict | None:
             )
             judged.append(found[-1].judged())
             limits.append(each.result(snapshot.channels[column], method, found[-1], judged[-1]))
+    is_complete = all(each.columns for each in bands)
     verdict, obstacles = whole(
-        judged, _general_obstacles(snapshot), is_complete=not snapshot.not_estimated
+        judged,
+        _general_obstacles(snapshot),
+        is_complete=is_complete and not snapshot.not_estimated,
     )
+    if verdict is Verdict.NOT_DECIDED and not (is_complete or snapshot.not_estimated):
+        obstacles = (*obstacles, Obstacle.NO_CHANNEL)
     sensitivities = _named(snapshot, doubted.values())
     so_far = TestVerdict(verdict, tuple(limits), obstacles, sensitivities=sensitivities, k=quantile)
     if so_far.is_sure or snapshot.not_estimated:

@@ -23,7 +23,7 @@ from estimator.likelihood.dimension import BandDimension
 from estimator.likelihood.goodness_of_fit import BandTest
 from estimator.methods import self_noise
 from estimator.self_noise.result import Flag, SelfNoise
-from tests.daq.results.decision.benches import PLAIN, verdict_on
+from tests.daq.results.decision.benches import PLAIN, bench_with, verdict_on
 from tests.tui.example_snapshot import SETTINGS, diagnosed, made_snapshot
 
 
@@ -177,6 +177,18 @@ def test_a_test_without_segments_is_not_decided() -> None:
     found = verdict_on(replace(snapshot, csm=np.full_like(snapshot.csm, np.nan)), 5e-9)
     assert found.verdict is Verdict.NOT_DECIDED
     assert Obstacle.NO_SEGMENTS in found.obstacles
+
+
+@pytest.mark.parametrize(("psd", "verdict"), [(5e-9, "not-decided"), (1e-14, "fail")])
+def test_a_limit_of_a_channel_that_is_not_recorded_does_not_pass(psd: float, verdict: str) -> None:
+    bench = bench_with(psd)
+    (limit,) = bench.limits
+    other = limit.model_copy(update={"name": "other", "sensors": ("Q",)})
+    bench = bench.model_copy(update={"limits": (limit, other)})
+    found = Result(made_snapshot(n_effective=5000.0), SETTINGS, bench).verdict
+    assert found is not None
+    assert found.verdict == verdict
+    assert (found.obstacles == (Obstacle.NO_CHANNEL,)) == (verdict == "not-decided")
 
 
 def test_noise_that_may_come_from_the_clocks_does_not_fail() -> None:
