@@ -167,6 +167,14 @@ def _without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
     return np.asarray(wanted - basis @ (basis.conj().swapaxes(1, 2) @ wanted))
 
 
+def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Return solutions, the smallest where one segment alone has what there is."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right), np.complex128)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(matrix, hermitian=True) @ right, np.complex128)
+
+
 def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[FloatArray, FloatArray]:
     """Return the evidence of square and cube, (n,), and the power that they explain, (n_freqs, n).
 
@@ -183,8 +191,8 @@ def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[FloatArr
     U, V = u.sum(axis=1), np.einsum("bkci,bkcj->bcij", u, u.conj())
     G = np.einsum("fkci,fkcj->fcij", q.conj(), q)
     A = np.add.reduceat(G * weight[..., None, None], first)
-    coefficient = np.linalg.solve(A, U[..., None])[..., 0]
-    share = (U.conj() * np.linalg.solve(V, U[..., None])[..., 0]).real.sum(axis=2) / n
+    coefficient = _solved(A, U[..., None])[..., 0]
+    share = (U.conj() * _solved(V, U[..., None])[..., 0]).real.sum(axis=2) / n
     share = np.clip(share * left / n, 0.0, 1 - 1e-9)
     degrees = left - _TERMS
     # P(Beta(2, degrees) > share); their logarithms add up (Fisher)
@@ -192,7 +200,7 @@ def _explained(rest: ComplexArray, block: IntArray, left: int) -> tuple[FloatArr
     half = len(first)  # degrees of freedom of -2 sum(log p), halved
     evidence = _normal(-log_p.sum(axis=0) / half, half)
     total = (U.conj() * coefficient).real.sum(axis=2)
-    chance = np.einsum("bcii->bc", np.linalg.solve(A, V)).real
+    chance = np.einsum("bcii->bc", _solved(A, V)).real
     true = np.maximum(1 - chance / np.maximum(total, 1e-300), 0.0)[block]
     c = coefficient[block]
     power = np.einsum("fci,fcij,fcj->fc", c.conj(), G, c).real / left

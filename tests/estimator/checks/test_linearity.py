@@ -54,6 +54,17 @@ def test_compression_is_found_in_all_channels_of_its_sensor(d: int) -> None:
     assert sorted(channels) == list(range(2 * d, 3 * d))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_code_for_missing_values_in_one_segment_is_no_error(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    samples = 10 * rng.standard_normal((60, 500, 1)) + rng.standard_normal((60, 500, 3))
+    samples[10, :100, 1] = 1e8
+    tested = SquaresAndCubes(WELCH, 45.0)
+    for segment in samples:
+        tested.add(segment)
+    assert tested.nonlinear(np.arange(3)) == []
+
+
 def test_a_square_before_a_filter_is_found() -> None:
     rng = np.random.default_rng(3)
     sensors = felt(rng, 60.0, 3, 1)
