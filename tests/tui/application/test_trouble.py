@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from daq.errors import HuddleError
+from daq.recording.sensor_state import SensorState
 from estimator.wording import clock_time
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.application.screen_text import resized, screen_text
@@ -194,3 +195,15 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
     assert [each for each in told.announced if words in each] == [
         f"trouble: {words}: check its input or its place"
     ]
+
+
+async def test_an_alert_that_grows_by_a_line_is_shown_whole(tmp_path: Path) -> None:
+    """Its second line was cut: the height followed the number of alerts, not of lines."""
+    silent = made_now()
+    *others, lost = silent.sensors
+    lost = replace(lost, state=SensorState.DISCONNECTED)
+    async with opened(ProgressCallback(tmp_path / "run.h5"), size=NARROW) as (app, pilot):
+        await shown(pilot, app, *running(now=silent))
+        await shown(pilot, app, StatusUpdated(replace(silent, sensors=(*others, lost))))
+        await pilot.pause()
+        assert "reconnects automatically" in " ".join(screen_text(app).split())

@@ -122,7 +122,9 @@ class Board(Vertical):
             more = f"  +{len(alerts) - room}: d"
             alerts = [*alerts[: room - 1], alerts[room - 1].append(more)]
         self.set_class(bool(alerts), "-alert")
-        self._write("#alert", Text("\n").join(alerts), n_lines=len(alerts))
+        text = Text("\n").join(alerts)
+        n_lines = len(text.wrap(self.app.console, max(1, self.size.width - 2)))
+        self._write("#alert", text, n_lines=n_lines)
 
     def _draw_curves(self) -> None:
         shown = self._frozen or self._shown
