@@ -587,9 +587,9 @@ def _second_motion(
     if len(snapshot.dims) != _THREE or not (none.mean(axis=0) > MOST_FREQUENCIES).any():
         return 0.0
     motion = np.maximum(np.nan_to_num(snapshot.data_psd) - psd, 0.0)
-    part = advice.error * np.median(psd[failed]) / np.median(motion[failed])
     moving, noise = (_by_block(frequency, values) for values in (motion, psd))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # noise of all that was recorded
+        part = advice.error * np.median(psd[failed]) / np.median(motion[failed])
         share = np.nan_to_num(part * moving / noise)
     return np.where(share < NOTHING_USEFUL, share, math.inf)
 
