@@ -250,9 +250,11 @@ def _sensor_table(device: DiscoveredDevice) -> str:
 
 
 def _summary(bench: Bench) -> str:
+    from estimator.wording import several
+
     estimate = bench.estimate
     sensors = ", ".join(
-        f"{sensor.name} ({len(sensor.main)} channels at {sensor.sampling_rate:g} Hz)"
+        f"{sensor.name} ({several(len(sensor.main), 'channel')} at {sensor.sampling_rate:g} Hz)"
         for sensor in bench.sensors
     )
     return (

@@ -413,7 +413,9 @@ def test_init_writes_a_bench_file_that_check_accepts(tmp_path: Path) -> None:
     bench = tmp_path / "lab.toml"
     printed("init", "--out", str(bench))
     before = bench.read_text(encoding="utf-8")
-    assert ": no errors." in printed("check", str(bench), "--no-devices")
+    said = printed("check", str(bench), "--no-devices")
+    assert ": no errors." in said
+    assert "A (3 channels at 200 Hz)" in said
     assert "--force replaces it" in words_of("init", "--out", str(bench), code=2)
     assert bench.read_text(encoding="utf-8") == before
 
