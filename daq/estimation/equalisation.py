@@ -425,7 +425,7 @@ def _by_all_others(band: Band, dims: tuple[int, ...]) -> SelfNoise | None:
 
 def _key(bands: Sequence[Band]) -> tuple[tuple[float, int], ...]:
     """Return what tells averages from others, without keeping them."""
-    return tuple((band.n_effective, hash(band.csm.tobytes())) for band in bands)
+    return tuple((band.n_effective, hash(band.csm.sum(axis=1).tobytes())) for band in bands)
 
 
 def _held(response: ComplexArray) -> ComplexArray:

@@ -364,13 +364,10 @@ def _spread(
 
 
 def known_part(band: Band, usable: float) -> Band:
-    """Return averages of which nothing is known above `usable` Hz, nor where detrending bends."""
+    """Return averages with nothing known above `usable` Hz, and where detrending bends: itself."""
     unknown = (band.frequencies > usable) | (band.frequencies < band.settings.lowest)
-    if not unknown.any():
-        return band
-    csm = band.csm.copy()
-    csm[unknown] = np.nan
-    return replace(band, csm=csm)
+    band.csm[unknown] = np.nan
+    return band
 
 
 def in_units(
