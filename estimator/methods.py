@@ -15,7 +15,7 @@ from estimator.levels.noise_matrices import together
 from estimator.levels.pooled import EQUATIONS, most_pooled, pooled_noise
 from estimator.likelihood.maximum_likelihood import maximum_likelihood
 from estimator.median import median
-from estimator.self_noise.coherency import check_averages, coherency
+from estimator.self_noise.coherency import Coherency, check_averages, coherency
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.self_noise.three_channel import three_channel
 from estimator.self_noise.three_sensor import three_sensor
@@ -117,9 +117,10 @@ def self_noise(
         check_averages(n_effective)
         n_dims = _dimensions(options.get("n_factors"), dims, len(csm))
     found, last = known, False
-    if found is None and by_engine and method == "maximum-likelihood":
+    given = coherency(csm, dims) if by_engine else None
+    if found is None and given is not None and method == "maximum-likelihood":
         options["matrices"] = False  # the engine has them
-        last = _only_where_asked(csm, dims, n_dims)
+        last = _only_where_asked(given, dims, n_dims)
     if last:
         unknown = np.full((4, *csm.shape[:2]), np.nan)
         found = SelfNoise.of(method, unknown[0], unknown[1:], np.zeros(csm.shape[:2], np.int64))
@@ -133,14 +134,14 @@ def self_noise(
         return SelfNoise.of(method, itself.noise_psd, scale * itself.cumulants, itself.flags)
 
     found = found or by_method()
-    if by_engine:
+    if given is not None:
         every = np.arange(len(dims))[None] if groups is None else groups
         # With counts, for without them NumPy imports its masked arrays.
         for group in np.unique(every, axis=0, return_counts=True)[0]:
             here = (every == group).all(axis=1) & ~is_real
             found = _with_neighbours(
                 found,
-                csm,
+                given,
                 np.where(here, -1 if blocks is None else blocks, -1),
                 n_dims,
                 dims=dims,
@@ -162,7 +163,7 @@ def self_noise(
     return found
 
 
-def _only_where_asked(csm: ComplexArray, dims: tuple[int, ...], n_dims: IntArray) -> bool:
+def _only_where_asked(given: Coherency, dims: tuple[int, ...], n_dims: IntArray) -> bool:
     """Whether the likelihood of a frequency says nothing of others, nor of what the engine needs.
 
     It finds channels without a counterpart, and fits of usual dimensions are the prior of further
@@ -171,7 +172,7 @@ def _only_where_asked(csm: ComplexArray, dims: tuple[int, ...], n_dims: IntArray
     if len(set(dims)) > 1 or n_dims.max(initial=0) > max(dims):
         return False
     faults = Flag.DEAD_CHANNEL | Flag.DUPLICATE
-    return not (coherency(csm, dims).flags & faults).any()
+    return not (given.flags & faults).any()
 
 
 def _dimensions(n_factors: int | IntArray | None, dims: tuple[int, ...], n_freqs: int) -> IntArray:
@@ -214,7 +215,7 @@ def _scale(psd: FloatArray, rest: FloatArray, block: IntArray, n_effective: floa
 
 def _with_neighbours(
     found: SelfNoise,
-    csm: ComplexArray,
+    given: Coherency,
     blocks: IntArray,
     n_dims: IntArray,
     *,
@@ -232,7 +233,6 @@ def _with_neighbours(
     sensors of one `group` may share noise.
     """
     missing = Flag.DEAD_CHANNEL | Flag.DUPLICATE | Flag.NO_COUNTERPART
-    given = coherency(csm, dims)
     good = given.valid & (blocks >= 0)
     if not good.any():
         return found
@@ -255,13 +255,13 @@ def _with_neighbours(
     most = most_pooled((usual,) * len(live))  # sensors that share noise count as one
     columns = columns[order]
     psd = given.psd[rows[:, None], columns]
-    matrix = given.matrix
-    if len(rows) < len(found.flags) or not np.array_equal(columns, np.arange(len(sensor))):
-        matrix = matrix[rows[:, None, None], columns[:, None], columns]
-    del given  # as large as all averages
+    matrix = given.matrix[rows[0] : rows[-1] + 1]  # nobody else needs it: it is as large as csm
+    if len(rows) < len(matrix) or not np.array_equal(columns, np.arange(len(sensor))):
+        matrix = given.matrix[rows[:, None, None], columns[:, None], columns]
     turn = phases(matrix, rows, live, n_effective, number)
     if turn is not None:
-        matrix = matrix * turn[:, :, None] * turn[:, None, :].conj()
+        matrix *= turn[:, :, None]
+        matrix *= turn[:, None, :].conj()
     rest, _ = unpredicted(
         matrix,
         dims=live,
