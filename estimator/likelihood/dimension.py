@@ -463,7 +463,8 @@ class _Search:
             few = self._matrix[rows[:, None, None], channels[:, None], channels]
             maximum = maximise(few, q, most=LOOK_STEPS)
         elif q <= self._usual:
-            maximum = self._maxima.maximise(self._matrix[rows], q)
+            whole = len(rows) == len(self._matrix)
+            maximum = self._maxima.maximise(self._matrix if whole else self._matrix[rows], q)
         else:
             maximum = maximise_expecting(
                 self._matrix[rows],

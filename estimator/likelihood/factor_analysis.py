@@ -314,7 +314,7 @@ class Maxima:
     ) -> Maximum:
         """Return `maximise` without a penalty, of some matrices perhaps from before."""
         keys = [  # no minus zeros
-            (n_factors, dims, hash(each.tobytes())) for each in np.add(csm, 0.0, order="C")
+            (n_factors, dims, hash(np.add(each, 0.0, order="C").tobytes())) for each in csm
         ]
         before = [self._found.get(key) for key in keys]
         missing = [row for row, each in enumerate(before) if each is None]

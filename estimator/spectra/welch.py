@@ -28,7 +28,7 @@ from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**20  # maximum number of values per group: 8 MB
 FREQUENCIES_PER_BLOCK = 512
-PRODUCT_VALUES = 2**22  # maximum number of values of products of channels at a time: 32 MB
+PRODUCT_VALUES = 2**19  # maximum number of values of products of channels at a time: 4 MB
 KEPT_VALUES = 10**7  # maximum number of values of products that are kept: 80 MB
 TOGETHER = 16  # segments of many channels whose products are added together
 BENT = 0.01
