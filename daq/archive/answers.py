@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from daq.archive import spectra_file
 from daq.archive.averages import Average, Estimator, converted
-from daq.archive.changes import Course, courses
+from daq.archive.changes import Course, courses, of_loudness
 from daq.archive.density import MIN_BINS, Density
 from daq.archive.index import ROLLUP, IndexEntry
 from daq.archive.plan import settings_document
@@ -464,7 +464,12 @@ def answer(
             between = years.grid.more(noise, alone[0] / alone[1])
             span = years.grid.span(tally.bands[0])
             more = years.grid.average(between, [span])[0] / years.grid.average(noise, [span])[0]
-        snapshot = beside_stretches(snapshot, years.grid.at_bins(between))
+        mean, spread = (tally.of_all(name)[:, 0].T for name in ("mean", "spread"))
+        n_segments = tally.of_all("day_segments")
+        each = zip(mean, spread, strict=True)
+        of_days = [of_loudness(y, deviation, n_segments) for y, deviation in each]
+        between = years.grid.at_bins(between)
+        snapshot = beside_stretches(snapshot, between, np.array(of_days))
     days = tally.of_all("days")
     levels = AnsweredLevels(*(tally.of_all(each.name) for each in fields(AnsweredLevels)))
     n_series = levels.mean.shape[1] * levels.mean.shape[2]

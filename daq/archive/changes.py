@@ -362,6 +362,24 @@ def _scatter(x: FloatArray, deviation: FloatArray) -> float:
     return mean * freedom / float(chdtri(freedom, 0.95))
 
 
+def of_loudness(y: FloatArray, s: FloatArray, n_segments: IntArray) -> float:
+    """Return what the scatter from day to day adds to the standard deviation of the mean of days.
+
+    As a fraction of the mean; 0 where days scatter no more than stated, by a test at 1 % of the
+    differences of successive days, which a slow change is not in.
+    """
+    known = np.isfinite(y) & (s > 0)
+    y, s, share = y[known], s[known], n_segments[known] / max(1, int(n_segments[known].sum()))
+    mean = float(share @ y)
+    if len(y) < MIN_DAYS or mean <= 0:
+        return 0.0
+    square = float(np.mean(np.diff(y) ** 2 / (s[1:] ** 2 + s[:-1] ** 2)))
+    freedom = 2 * (len(y) - 1) / 3
+    if square * freedom < float(chdtri(freedom, 0.01)):
+        return 0.0
+    return math.sqrt((square - 1) * float(share**2 @ s**2)) / mean
+
+
 def _correlation(x: FloatArray, deviation: FloatArray) -> float:
     """Return the correlation of the scatter from one day to the next, 0 unless it lasts.
 

@@ -207,6 +207,8 @@ def _counts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution
 
 def _gusts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]:
     """Yield how much the mean noise scatters with its loudness."""
+    if snapshot.of_days is not None:
+        yield contribution(Source.GUSTS, shape, deviation=snapshot.of_days)
     if (loudness := snapshot.diagnostics.loudness) is not None:
         yield contribution(Source.GUSTS, shape, deviation=loudness.deviation)
 
@@ -277,9 +279,9 @@ def with_sensitivities(snapshot: Snapshot, sensitivities: Sensitivities) -> Snap
     return _anew(replace(snapshot, sensitivities=sensitivities))
 
 
-def beside_stretches(snapshot: Snapshot, between: FloatArray) -> Snapshot:
-    """Return a finished snapshot with `Snapshot.between`, in all intervals."""
-    return _anew(replace(snapshot, between=between))
+def beside_stretches(snapshot: Snapshot, between: FloatArray, of_days: FloatArray) -> Snapshot:
+    """Return a finished snapshot with `Snapshot.between` and `of_days`, in all intervals."""
+    return _anew(replace(snapshot, between=between, of_days=of_days))
 
 
 def _anew(snapshot: Snapshot) -> Snapshot:

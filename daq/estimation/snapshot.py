@@ -265,6 +265,8 @@ class Snapshot:
         Share of the data's PSD by which the noise may be off, because cross-spectra were rounded.
     between : float64, shape (n_freqs, n_channels), or None
         What the noise of an archive has, in unit**2/Hz, over that of stretches estimated alone.
+    of_days : float64, shape (n_channels,), or None
+        Standard deviation that the loudness of days adds to the logarithm of the noise there.
     sensitivities : mapping of (str, str) to KnownSensitivity
         What is known of sensitivities, by names of sensor and channel; not in it: nothing.
     caveats : Caveats
@@ -312,6 +314,7 @@ class Snapshot:
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0
     between: FloatArray | None = None
+    of_days: FloatArray | None = None
     sensitivities: Sensitivities = field(default_factory=dict)
     caveats: Caveats = NO_CAVEATS
     channel_segments: tuple[int, ...] = ()

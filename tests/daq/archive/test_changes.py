@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 from benchmarks.studies.hours import MONDAY, days_of, drawn
-from daq.archive.changes import DAYS_PER_YEAR, Course, courses, line
+from daq.archive.changes import DAYS_PER_YEAR, Course, courses, line, of_loudness
 from daq.archive.spectra_file import DAY_NS
 
 DAYS = np.arange(40.0)
@@ -219,3 +219,14 @@ def test_scatter_that_lasts_for_days_is_no_change() -> None:
     rng = np.random.default_rng(16)
     found = [courses(*days_of(drawn(rng, n_days=60, lasting_db=0.3)))[0] for _ in range(60)]
     assert sum(bool(each.steps) for each in found) <= 10  # without allowing for it, 50
+
+
+@pytest.mark.parametrize("n_days", [8, 30])
+def test_loudness_that_scatters_from_day_to_day_is_in_the_mean_of_days(n_days: int) -> None:
+    rng = np.random.default_rng(n_days)
+    counts, s = np.full(n_days, 100), np.full(n_days, 0.02)
+    drift = np.linspace(1.0, 1.0 + n_days / 300, n_days)
+    false = [of_loudness(drift + s * rng.normal(size=n_days), s, counts) for _ in range(400)]
+    assert np.count_nonzero(false) <= 16
+    loud = [of_loudness(1 + 0.2 * rng.normal(size=n_days), s, counts) for _ in range(400)]
+    assert np.median(loud) == pytest.approx(0.2 / np.sqrt(n_days), rel=0.15)
