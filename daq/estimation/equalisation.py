@@ -68,6 +68,8 @@ _IMPERFECT = 2e-3  # share of the leakage that equalisation may leave unseen
 _AT_LOW = 6.0  # lines of a spectrum, below which it is more: filters know little of 0 Hz
 _MIN_AVERAGES = 20.0  # averages, below which responses are too uncertain to estimate filters from
 _KNOWN = 0.9  # share of frequencies at which the others predict every channel
+_JUMPS = 1.0  # leakage that noise feigns, over the noise, from which windows jump at their ends
+_FROM_AFAR = 2.0  # of what leaks through jumps, that more may leak: lines hide their own responses
 _FINE = 4  # points of known responses for each of a spectrum
 
 
@@ -113,6 +115,7 @@ class Equalisation:
         self._mode, self._welch, self._dims, self._intervals = mode, welch, dims, intervals
         window = get_window(welch.window, welch.segment_length)
         self._factor = slope_factor(window, welch.sampling_rate)
+        self._jumps = scatter_of_slopes(window, welch.sampling_rate) > _JUMPS
         known = mode in {"auto", "known"} and len(channels) > 1
         self.known = self._by_bench(channels) if known else None
         self._found: tuple[tuple[tuple[float, int], ...], _Leaks | None] = (), None
@@ -319,6 +322,7 @@ class Equalisation:
             scale = np.abs(response) ** -2.0
         share = np.concatenate([_unseen(band) for band in bands])[:, None]
         unseen = share * np.maximum(whole.left, 0.0) * (self.filters is not None)
+        unseen += _FROM_AFAR * np.maximum(found.left, 0.0) * self._jumps
         with np.errstate(divide="ignore", invalid="ignore"):  # responses vanish at 0 Hz
             return EdgeLeakage(
                 left=found.left * scale,
@@ -394,12 +398,17 @@ class Equalisation:
                 csm = csm * inverse[:, :, None] * inverse[:, None, :].conj()
             at += len(band.frequencies)
             window = get_window(band.settings.window, band.settings.segment_length)
-            factor = slope_factor(window, band.settings.sampling_rate)
-            left, deviation = channel_responses(csm, band.frequencies, dims=self._dims).leakage(
-                motion, factor, n_effective=band.n_effective
-            )
-            feigned = scatter_of_slopes(window, band.settings.sampling_rate) / band.n_effective
-            left -= feigned * np.where(np.isfinite(noise), np.abs(noise), 0.0)
+            rate, n_effective = band.settings.sampling_rate, band.n_effective
+            responses = channel_responses(csm, band.frequencies, dims=self._dims)
+            if self._jumps:
+                left, deviation = responses.leakage_from_afar(
+                    motion, window, rate, n_effective=n_effective
+                )
+            else:
+                factor = slope_factor(window, rate)
+                left, deviation = responses.leakage(motion, factor, n_effective=n_effective)
+                feigned = scatter_of_slopes(window, rate) / n_effective
+                left -= feigned * np.where(np.isfinite(noise), np.abs(noise), 0.0)
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
             left = np.where(share > _SEEN * deviation, left, 0.0)  # the rest is scatter
             least = significant_minimum(share, deviation, band.frequencies)

@@ -28,6 +28,8 @@ from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_COHERENCE = 0.3
 """Minimum coherence between a channel and its prediction at a used frequency."""
+_LEAST_OWN = 0.1  # of the power of a line, below which all has leaked from others
+_FEIGNED = 0.46  # leakage that the error of responses feigns, over its power; it scatters twice so
 _TWO_FREQUENCIES = 1.67  # 2 (1 - 1/6): variance of a difference two bins apart under Hann
 _CORRELATED = 2.0  # variance of a sum over that of independent frequencies
 _MAX_FREQUENCIES = 128  # maximum number of frequencies for the directions
@@ -135,6 +137,77 @@ class ChannelResponses:
             pairs[:, some], deviation[:, some] = part._of_pairs(n_effective)
         power = np.where(np.isfinite(motion_psd), np.maximum(motion_psd, 0.0), 0.0) * factor
         return np.asarray(power * pairs), np.asarray(power * deviation)
+
+    def leakage_from_afar(
+        self,
+        motion_psd: FloatArray,
+        window: FloatArray,
+        sampling_rate: float,
+        *,
+        n_effective: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return `leakage` under a window that jumps at its ends, and its standard deviation.
+
+        Motion then leaks from all frequencies, and slopes do not tell by how much responses differ
+        there. Between the lines of the spectrum responses are interpolated.
+
+        Parameters
+        ----------
+        motion_psd : float64, shape (n_freqs, n_channels)
+        window : float64, shape (length,)
+            `frequency` are lines of its spectrum.
+        sampling_rate : float
+            Hz.
+        n_effective : float
+
+        Returns
+        -------
+        leakage, deviation : float64, shape (n_freqs, n_channels)
+            Without what the noise of the averages feigns.
+
+        Notes
+        -----
+        With K the power of the window's transform, P the PSD of the motion in channel c and
+        ``g_j = 1 / D_cj``, the averages are ``S_jk = K * (P g_j conj(g_k))``, of c with g = 1. The
+        three-sensor formula leaves ``Re[S_cc - S_ck S_jc / S_jk]``.
+        """
+        length = len(window)
+        lags = np.fft.irfft(np.abs(np.fft.rfft(window, 2 * length)) ** 2, 2 * length)
+        lines = np.rint(self.frequency * length / sampling_rate).astype(int)
+        halves = np.arange(length + 1) / 2
+
+        def averaged(density: ComplexArray) -> ComplexArray:
+            flat = density.reshape(-1, len(lines))
+            between = np.array([np.interp(halves, lines, each) for each in flat])
+            course = np.fft.irfft(between, 2 * length) * lags / lags[0]
+            return np.asarray(np.fft.rfft(course)[:, 2 * lines].reshape(density.shape))
+
+        leakage, feigned = np.zeros((2, *motion_psd.shape))
+        for channel, found in enumerate(np.nan_to_num(motion_psd).T):
+            sensors = np.flatnonzero((self.coherence[:, channel] > MIN_COHERENCE).any(axis=0))
+            if len(sensors) < 2:
+                continue
+            with np.errstate(invalid="ignore", divide="ignore"):
+                g = 1 / self.ratio[:, channel, sensors].T
+            known = self.coherence[:, channel, sensors].T
+            usable = np.isfinite(g).all(axis=0) & (known > MIN_COHERENCE).all(axis=0) & (found > 0)
+            power, g = np.where(usable, found, 0.0), np.where(usable, g, 0.0)
+            error = np.sqrt((1 / np.where(usable, known, 1.0) - 1) / n_effective)
+            # responses and power without what has leaked to a line from others
+            own, crossed = (2 * each - averaged(each) for each in (power, power * g.conj()))
+            there = own.real > _LEAST_OWN * power
+            own = np.where(there, own.real, 0.0)
+            g = np.where(there, crossed.conj() / np.where(there, own, 1.0), 0.0)
+            error *= np.where(there, power / np.where(there, own, 1.0), 1.0)
+            whole, by = averaged(own), averaged(own * g.conj())
+            pairs = [(j, (j + 1) % len(g)) for j in range(len(g) if len(g) > 2 else 1)]
+            for j, k in pairs:
+                between = averaged(own * g[j] * g[k].conj())
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    left = (whole - by[k] * by[j].conj() / between).real
+                leakage[:, channel] += np.nan_to_num(left) / len(pairs)
+                feigned[:, channel] += _FEIGNED * power * error[j] * error[k] / len(pairs)
+        return leakage - feigned, 2 * feigned
 
     def _of_pairs(self, n_effective: float) -> tuple[FloatArray, FloatArray]:
         """Return the mean of products of slopes over pairs of sensors, and its deviation."""

@@ -65,6 +65,35 @@ def test_a_delay_of_one_sample_under_a_rectangular_window() -> None:
     assert factor * (2 * np.pi / 200) ** 2 * 1e4 == pytest.approx(10.7, rel=0.1)
 
 
+def predicted_by_a_rectangular_window(response: np.ndarray) -> np.ndarray:
+    """Leakage into three sensors of one channel, of which B has a response, under 2000 ones."""
+    loading = np.ones((1001, 3), dtype=np.complex128)
+    loading[:, 1] = response
+    csm = SNR * loading[:, :, None] * loading[:, None].conj() + np.eye(3)
+    motion = SNR * np.abs(loading) ** 2
+    found = channel_responses(csm, FREQUENCY, dims=(1, 1, 1))
+    leakage, _ = found.leakage_from_afar(motion, np.ones(2000), 200.0, n_effective=24.0)
+    return leakage
+
+
+def test_a_delay_leaks_through_both_ends_of_a_rectangular_window() -> None:
+    # Of an average of 10 s, 5 ms at either end are in one sensor only.
+    leakage = predicted_by_a_rectangular_window(np.exp(-2j * np.pi * FREQUENCY * 0.005))
+    np.testing.assert_allclose(leakage[100:900, 1], 2 * SNR * 0.005 / T, rtol=0.03)
+    assert np.abs(leakage[:, [0, 2]]).max() < 0.1
+
+
+def test_motion_leaks_from_where_responses_differ_far_away() -> None:
+    # The integral of 1 / (2000 sin²(pi f / 200) 200) / 2 over 50 to 150 Hz: half of the samples'.
+    f, leakage = (
+        FREQUENCY[100:450],
+        predicted_by_a_rectangular_window(np.where(FREQUENCY < 50, 1, -1)),
+    )
+    low, high = (1 / np.tan(np.pi * (end - f) / 200) for end in (50, 150))
+    share = (low - high) / (2 * np.pi * 2000)
+    np.testing.assert_allclose(leakage[100:450, 1], 4 * SNR * share, rtol=0.03)
+
+
 @pytest.mark.parametrize("n_sensors", [3, 12])  # of twelve, not every sensor is a third one
 def test_responses_are_found_for_any_orientation(n_sensors: int) -> None:
     csm, _ = exact(n_sensors=n_sensors)
