@@ -218,7 +218,7 @@ class DiagnosticsBesides(TypedDict, total=False):
     wraps_at_bits: Annotated[Mapping[str, int], "Bits at which counts wrap, by affected channel."]
     stood_still_s: Annotated[
         Mapping[str, float],
-        "Seconds with a constant count or a straight line, by affected channel.",
+        "Seconds with a constant count, a line or a cubic, by affected channel.",
     ]
 
 

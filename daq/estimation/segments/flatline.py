@@ -1,9 +1,10 @@
-"""Channels that stand still for part of a recording, or follow a straight line: not measured.
+"""Channels that stand still for part of a recording, or follow a line or a cubic: not measured.
 
 A channel whose count does not change for a moment has lost its signal, or its counts are too
 coarse. One that stands still most of the time is no news: it is dead, or always that coarse. A
-straight line fills a gap. It is straight but for rounding, of counts or of decimals, while
-neighbouring samples usually differ by more: else it may be slow motion.
+straight line fills a gap, or a spline, which is one cubic from end to end. It is exact but for
+rounding, of counts or of decimals, while neighbouring samples usually differ by more: else it may
+be slow motion.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ FloatArray = NDArray[np.float64]
 _PARTS = 8  # of a hop, examined one by one
 _MIN_SAMPLES = 32  # samples of a part
 _STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
-_STRAIGHT = 0.03  # of its change: what leaves the line through its ends less may be on it
-_SLOPE = 16  # counts from end to end, from which whole numbers follow a line
-_ROUNDED = 1 + 1e-9  # counts: half of one at the ends, and half of one between
-_SMOOTH = 3  # sizes below the usual second difference, from which a line is no motion
+_CURVES = ((2, 0.03), (4, 1e-4))
+"""Points of a line, and of a cubic, and the share of their range: what leaves the curve through
+them less may be on it. Slow motion is a cubic to 1e-3."""
+_SLOPE = 16  # counts of that range, from which whole numbers follow a curve
+_HALF = 0.5 + 1e-9  # counts: rounding of the points, which the curve enlarges, and of those between
+_SMOOTH = 3  # sizes below the usual second difference, from which a curve is no motion
 _SIZES = 64  # factors of four, from 4**-32
 
 
@@ -29,7 +32,7 @@ def stands_still(samples: FloatArray) -> NDArray[np.bool_]:
 
 
 class FlatlineDetector:
-    """How long each channel has stood still or followed a straight line, hop by hop.
+    """How long each channel has stood still or followed a line or a cubic, hop by hop.
 
     Parameters
     ----------
@@ -47,7 +50,12 @@ class FlatlineDetector:
         self._seconds = hop / self._n_parts / sampling_rate
         self.counts = np.zeros((1 + 2 * _SIZES, n_channels), dtype=np.int64)
         """Parts in which each channel stood still; by size, those with such a second difference,
-        and those that leave a line by so much."""
+        and those that leave a curve by so much."""
+        self._curves = []
+        for points, share in _CURVES:
+            at = np.rint(np.linspace(0, self._length - 1, points)).astype(int)
+            powers = np.vander(np.linspace(-1, 1, self._length), points)
+            self._curves.append((at, share, powers @ np.linalg.inv(powers[at])))
 
     def add(self, samples: FloatArray, usable: NDArray[np.bool_]) -> None:
         """Look at whole hops of `samples`, shape (n_samples, n_channels), where all are usable."""
@@ -61,24 +69,28 @@ class FlatlineDetector:
             parts = parts[used.all(axis=1)]
         if not len(parts):
             return
-        first, change = parts[:, 0], parts[:, -1] - parts[:, 0]
-        allowed = np.maximum(_STILL * np.abs(first), _STRAIGHT * np.abs(change))
-        whole = (np.rint(first) == first) & (np.rint(change) == change)
-        rounded = whole & (np.abs(change) >= _SLOPE)
-        allowed[rounded] = np.maximum(allowed[rounded], _ROUNDED)
-        middle, last = self._length // 2, self._length - 1
+        rest, middle = _STILL * np.abs(parts[:, 0]), self._length // 2
         bend = np.abs(parts[:, middle - 1] - 2 * parts[:, middle] + parts[:, middle + 1])
         self._count(1, bend, np.ones(bend.shape, np.bool_))
-        perhaps: NDArray[np.bool_] = bend <= 4 * allowed
-        for place in range(self._length // 3, last, self._length // 3):
-            line = first + change * (place / last)
-            perhaps &= np.abs(parts[:, place] - line) <= allowed
-        some = np.flatnonzero(perhaps.any(axis=1))
-        along = np.linspace(0.0, 1.0, self._length)[:, None]
-        beside = np.abs(parts[some] - first[some, None] - along * change[some, None]).max(axis=1)
-        still = beside <= _STILL * np.abs(first[some])
+        still, nearest = np.zeros(bend.shape, np.bool_), np.full(bend.shape, np.inf)
+        for at, share, weights in self._curves:
+            points = parts[:, at]
+            wide = np.ptp(points, axis=1)
+            allowed = np.maximum(rest, share * wide)
+            rounded = (np.rint(points) == points).all(axis=1) & (wide >= _SLOPE)
+            most = _HALF * (1 + np.abs(weights).sum(axis=1).max())
+            allowed[rounded] = np.maximum(allowed[rounded], most)
+            perhaps = np.ones(bend.shape, np.bool_)
+            for place in self._length * np.arange(1, 6, 2) // 6:
+                curve = sum(w * points[:, n] for n, w in enumerate(weights[place]))
+                perhaps &= np.abs(parts[:, place] - curve) <= allowed
+            some = np.flatnonzero(perhaps.any(axis=1))
+            beside = np.abs(parts[some] - weights @ points[some]).max(axis=1)
+            still[some] |= (len(at) == 2) & (beside <= rest[some])
+            on_it = np.where(beside <= allowed[some], beside, np.inf)
+            nearest[some] = np.minimum(nearest[some], on_it)
         self.counts[0] += still.sum(axis=0)
-        self._count(1 + _SIZES, beside, (beside <= allowed[some]) & ~still)
+        self._count(1 + _SIZES, nearest, np.isfinite(nearest) & ~still)
 
     def _count(self, row: int, values: FloatArray, which: NDArray[np.bool_]) -> None:
         """Count some values, (n_parts, n_channels), by size, from a row of `counts` on."""
@@ -91,9 +103,9 @@ class FlatlineDetector:
 
     def for_a_while(self) -> FloatArray:
         """Return for how long each channel was not measured, in seconds; 0 if most of the time."""
-        bends, lines = self.counts[1 : 1 + _SIZES], self.counts[1 + _SIZES :]
+        bends, curves = self.counts[1 : 1 + _SIZES], self.counts[1 + _SIZES :]
         seen = bends.sum(axis=0)
         usual = (2 * np.cumsum(bends, axis=0) < seen).sum(axis=0)
-        straight = np.arange(_SIZES)[:, None] <= usual - _SMOOTH
-        still = self.counts[0] + (lines * straight).sum(axis=0)
+        smooth = np.arange(_SIZES)[:, None] <= usual - _SMOOTH
+        still = self.counts[0] + (curves * smooth).sum(axis=0)
         return np.where(2 * still < seen, still * self._seconds, 0.0)

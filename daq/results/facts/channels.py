@@ -130,7 +130,7 @@ class ReadingsRepeat(Fact):
 
 
 class ChannelsStoodStill(Fact):
-    """Channels had a constant count or a straight line for a while.
+    """Channels had a constant count, a line or a cubic for a while.
 
     Attributes
     ----------
@@ -145,9 +145,9 @@ class ChannelsStoodStill(Fact):
         channels = [f"{name} (for {seconds:.2g} s)" for name, seconds in each]
         who = ", ".join(channels)
         return Words(
-            f"{few(channels)} had constant counts or a straight line: noise wrong; exclude that "
+            f"{few(channels)} had constant counts, a line or a cubic: noise wrong; exclude that "
             "time (--reject)",
-            f"Temporarily not measured: {who} had a constant count, or followed a straight line "
+            f"Temporarily not measured: {who} had a constant count, or followed a line or a cubic "
             "as where a gap is interpolated. The motion missing there counts as noise; the noise "
             "missing there lowers the level.",
             "Exclude that time (--reject; --start and --end for minutes). Import gaps as gaps, not "

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from daq.bench.channel import Channel
 from daq.errors import CannotAlignError
@@ -180,6 +181,17 @@ def test_lines_of_decimals_are_seen_but_for_their_rounding(decimals: int) -> Non
     detector = FlatlineDetector(500, 1, RATE)
     detector.add(samples, np.ones(len(samples), np.bool_))
     assert detector.for_a_while()[0] == pytest.approx(30, abs=1)
+
+
+@pytest.mark.parametrize("counts", [0, 200])
+def test_gaps_that_a_spline_fills_are_seen(counts: int) -> None:
+    samples = np.random.default_rng(3).standard_normal(60_000) * max(counts, 1)
+    known = np.r_[9_980:10_000, 10_500:10_520]
+    samples[10_000:10_500] = CubicSpline(known, samples[known])(np.arange(10_000, 10_500))
+    samples = np.rint(samples) if counts else samples
+    detector = FlatlineDetector(500, 1, RATE)
+    detector.add(samples[:, None], np.ones(len(samples), np.bool_))
+    assert detector.for_a_while()[0] == pytest.approx(5, abs=1)
 
 
 def test_slow_motion_in_coarse_counts_is_not_interpolated() -> None:
