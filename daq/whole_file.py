@@ -26,6 +26,7 @@ PRIVATE = 0o600
 """Permissions of what only its owner may read, such as recordings and keys."""
 _PUBLIC = 0o666
 _SUFFIX = ".part"
+_REMOVALS, _PAUSE = 10, 0.05  # times that a folder is emptied, and seconds between
 _STALE_SECONDS = 86400.0
 """Age in s from which a hidden file is a leftover of a process that was killed."""
 _NO_HARD_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EINVAL}
@@ -87,12 +88,17 @@ def take_name(part: Path, path: Path) -> None:
 
 
 def remove(part: Path) -> None:
-    """Remove what is left of a hidden file or folder, if it can be removed."""
+    """Remove what is left of a hidden file or folder, if it can be removed.
+
+    Threads of Zarr go on writing into a folder after one has failed: it is emptied again.
+    """
+    for _ in range(_REMOVALS if part.is_dir() else 0):
+        shutil.rmtree(part, ignore_errors=True)
+        if not part.exists():
+            return
+        time.sleep(_PAUSE)
     with contextlib.suppress(OSError):
-        if part.is_dir():
-            shutil.rmtree(part)
-        else:
-            part.unlink()
+        part.unlink()
 
 
 def remove_parts(folder: Path, name: str, *, age: float = 0.0) -> None:

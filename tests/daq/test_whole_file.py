@@ -8,6 +8,7 @@ import io
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 from daq.archive.spectra_file import Described, Origin, SpectraFile, SpectraWriter
 from daq.bench.channel import Channel
 from daq.recording.storage.whole_hdf5 import WholeHdf5
-from daq.whole_file import RememberingFile, replaced, write_whole, written
+from daq.whole_file import RememberingFile, remove, replaced, write_whole, written
 from tests.full_disk import files_limited_to
 
 CHANNELS = tuple(("A", Channel(name=name, sensitivity=1.0)) for name in "abcdef")
@@ -129,6 +130,24 @@ def test_leftovers_of_killed_processes_are_removed_after_a_day(tmp_path: Path) -
     os.utime(old, (1.0, 1.0))
     write_whole(tmp_path / "r.csv", b"")
     assert names_in(tmp_path) == [".r.csv.2.part", "r.csv"]
+
+
+def test_a_folder_into_which_a_thread_still_writes_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zarr's threads go on after one has failed, and left a hidden folder."""
+    part, late, rmdir = tmp_path / ".e.zarr.part", ["chunk"], os.rmdir
+    part.mkdir()
+
+    def write_late(*args: Any, **names: Any) -> None:  # noqa: ANN401
+        while late:
+            (part / late.pop()).write_bytes(b"")
+        rmdir(*args, **names)
+
+    monkeypatch.setattr(os, "rmdir", write_late)
+    remove(part)
+    assert not late
+    assert not part.exists()
 
 
 def test_a_write_that_fails_once_is_remembered(tmp_path: Path) -> None:
