@@ -116,7 +116,8 @@ class DimensionsChosen(Fact):
         lines += [_choice(choice) for choice in self.choices if not choice.gradients]
         if self.elsewhere:
             where = "Elsewhere" if self.choices else "In all bands"
-            lines.append(f"{where} the motion has all {self.usual} dimensions.")
+            size = "one dimension" if self.usual == 1 else f"all {self.usual} dimensions"
+            lines.append(f"{where} the motion has {size}.")
         if not self.choices:
             return Words(lines[0].rstrip("."), lines[0])
         if any(choice.n_factors > choice.usual for choice in self.choices):

@@ -17,6 +17,7 @@ from tui.application.forms.estimate import SettingsForm
 from tui.application.state import RECORDINGS, RESULT, TEST, State
 from tui.application.view import BAD, MUTED, View
 from tui.runs.catalogue import Entry, catalogue
+from tui.wording.formatting import is_known
 from tui.wording.verdict_text import STYLES, WORDS
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ COLUMNS = ("started, UTC", "verdict", "length", "bench", "size", "file")
 def row(entry: Entry, *, shown: bool = False, is_reference: bool = False) -> tuple[Text, ...]:
     """Return the cells of a recording; the one that is shown in the other views is marked."""
     started = "?" if entry.created is None else f"{entry.created:%Y-%m-%d %H:%M}"
+    if entry.created is not None and not is_known(entry.created):
+        started = "no date"
     mark = "▸" if shown else "≈" if is_reference else " "
     return (
         Text(f"{mark} {started}"),
