@@ -32,7 +32,7 @@ class KnownSensitivity:
     is_certified : bool
         Whether a certificate states it.
     off : float
-        Difference of the certificate from the sensitivity that is used.
+        The sensitivity that is used over that of the certificate, less 1.
     coefficient : float
         Largest change of the sensitivity with temperature, in 1/°C; 0 where not stated.
     reference : float
@@ -116,7 +116,7 @@ def _known(channel: Mapping[str, Any], sheet: Mapping[str, Any]) -> KnownSensiti
     certificate = channel.get("certificate")
     if certificate is not None:
         value = float(certificate["value"])
-        off = abs(float(channel["sensitivity"]) / value - 1)
+        off = float(channel["sensitivity"]) / value - 1
         relative = float(certificate["expanded_uncertainty"]) / abs(value)
         own = math.hypot(relative / certificate.get("k", 2.0), off)
     reference = float(sheet.get("reference_temperature", REFERENCE_TEMPERATURE))

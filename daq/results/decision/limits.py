@@ -109,7 +109,7 @@ def _doubted(snapshot: Snapshot) -> dict[int, WrongGain]:
         for column, label in enumerate(snapshot.channels)
         if (known := snapshot.sensitivities.get((label.sensor, label.channel))) is not None
         and known.is_certified
-        and known.off <= TOLERANCE
+        and abs(known.off) <= TOLERANCE
     }
     faulty = snapshot.diagnostics.faulty
     found = wrong_gains(diagnosis.responses, snapshot.dims, certified=certified)

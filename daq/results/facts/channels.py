@@ -1,7 +1,8 @@
-"""Channels whose samples are wrong: the range, the counts, squares and cubes."""
+"""Channels whose samples are wrong: the range, the counts, certificates, squares and cubes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,6 +12,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
+from estimator.checks.sensitivities import CAUSES, TOLERANCE, likely_cause, wrong_gains
 from estimator.levels.bands import third_octaves
 from estimator.records import Hertz, Seconds
 from estimator.wording import Words, few, listed, percent, several
@@ -155,6 +157,30 @@ class ChannelsStoodStill(Fact):
         )
 
 
+class CertificateDiffers(Fact):
+    """Certificates of a sensor contradict the sensitivities of its bench file.
+
+    Attributes
+    ----------
+    factors : tuple of float
+        Sensitivity by the certificate over that of the bench file, for each of `channels`.
+    is_refuted : bool
+        Whether the sensor reads the motion of the others by the sensitivities of the bench file.
+    """
+
+    factors: tuple[float, ...]
+    is_refuted: bool
+
+    def _words(self) -> Words:
+        (name,), most = self.sensors, max(self.factors, key=lambda each: abs(math.log(abs(each))))
+        text = f"Certificate of {name}: {most:.3g} times the sensitivity in the bench file"
+        cause = likely_cause(abs(most))
+        why = "" if cause is None else f" ({CAUSES[cause]})"
+        agree = " The other sensors agree with the bench file." if self.is_refuted else ""
+        do = "Correct the certificate or the sensitivity."
+        return Words(f"{text}: correct one of them", f"{text}{why}.{agree}", do)
+
+
 class RoundedAlike(Fact):
     """Channels of several sensors are rounded to counts alike, and share a part of that noise.
 
@@ -249,6 +275,27 @@ def facts_of_channels(snapshot: Snapshot) -> Iterator[Fact]:
             rank=Rank.INVALIDATES,
             channels=tuple(names[column] for column in still),
             constant=tuple(still.values()),
+        )
+    yield from _certificates(snapshot)
+
+
+def _certificates(snapshot: Snapshot) -> Iterator[CertificateDiffers]:
+    """Yield the sensors whose certificates and sensitivities differ."""
+    diagnosis, of_sensors = snapshot.diagnostics.diagnosis, dict[str, dict[int, float]]()
+    for column, label in enumerate(snapshot.channels):
+        known = snapshot.sensitivities.get((label.sensor, label.channel))
+        if known is not None and known.is_certified and abs(known.off) > TOLERANCE:
+            of_sensors.setdefault(label.sensor, {})[column] = 1 / (1 + known.off or 1e-16)
+    for sensor, factors in of_sensors.items():
+        responses = () if diagnosis is None else diagnosis.responses
+        doubted = {each.channel for each in wrong_gains(responses, snapshot.dims)}
+        compared = {name for each in responses for name in (each.first, each.second)}
+        yield CertificateDiffers(
+            rank=Rank.DELAYS,
+            sensors=(sensor,),
+            channels=tuple(snapshot.channels[column].name for column in factors),
+            factors=tuple(factors.values()),
+            is_refuted=snapshot.sensor_names.index(sensor) in compared and not doubted & {*factors},
         )
 
 

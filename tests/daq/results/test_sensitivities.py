@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import numpy as np
 import pytest
 
-from daq.bench.sensitivity import KnownSensitivity
+from daq.bench.sensitivity import KnownSensitivity, known_sensitivities
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from daq.results.facts.channels import CertificateDiffers
 from daq.results.result import Result
 
 RATE, OWN, SNR = 100.0, 0.03, 300.0
@@ -67,3 +71,32 @@ def test_temperatures_and_certificates_are_in_the_interval() -> None:
     by_temperature = 1.96 * 2 * 0.04 / np.sqrt(3)
     assert widths["stated"] == pytest.approx(np.hypot(widths["exact"], 1.96 * 0.06), rel=1e-3)
     assert widths["warm"] == pytest.approx(np.hypot(widths["stated"], by_temperature), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "certificate", "words"),
+    [
+        (1.0, 9.80665, r"9.81 times .* \(g in place of m/s², or the reverse\)\. The other sensors"),
+        (9.80665, 9.80665, r"9.81 times .* \(g in place of m/s², or the reverse\)\. Correct"),
+        (1.0, -1.0, r"-1 times the sensitivity in the bench file\. The other sensors agree"),
+        (1.0, 1.04, None),
+    ],
+)
+def test_a_certificate_that_contradicts_the_bench_file_is_a_fact(
+    wrong: float, certificate: float, words: str | None
+) -> None:
+    rng = np.random.default_rng(5)
+    motion = 30 * rng.standard_normal(12_000)
+    samples = {name: motion + rng.standard_normal(12_000) for name in "ABC"}
+    samples["A"] *= wrong
+    settings = Settings(segment=1.0, axis_tolerance={"": 0.0})
+    one = {name: values[:, None] for name, values in samples.items()}
+    snapshot = estimate([recording_of_arrays(one, RATE)], settings)
+    ((_, name),) = {(each.sensor, each.channel) for each in snapshot.channels if each.sensor == "A"}
+    stated = {"value": certificate, "expanded_uncertainty": 0.01}
+    channel: dict[str, Any] = {"name": name, "sensitivity": 1.0, "certificate": stated}
+    table = {"sensors": [{"name": "A", "channels": [channel]}]}
+    found = Result(with_sensitivities(snapshot, known_sensitivities(table)), settings)
+    facts = [str(each) for each in found.facts if isinstance(each, CertificateDiffers)]
+    assert len(facts) == (words is not None)
+    assert all(re.search(words or "", each) for each in facts), facts

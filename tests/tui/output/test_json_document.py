@@ -117,7 +117,7 @@ DIMENSIONLESS = {
     *("worst_statistic", "p_value", "coherence", "coherence_error", "coherencies"),
     *("snr", "condition", "ratio", "standard_errors", "share_of_frequencies"),
     *("n_dimensions", "n_effective", "share_of_partners", "share_without", "inflation"),
-    *("delay_samples", "ppm", "bits", "evidence"),
+    *("delay_samples", "ppm", "bits", "evidence", "factors"),
 }
 """Numbers without a unit; samples, bits and ppm are their own."""
 

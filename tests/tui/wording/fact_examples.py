@@ -26,6 +26,7 @@ from daq.results.facts.changes import (
     SteadyGainsAssumed,
 )
 from daq.results.facts.channels import (
+    CertificateDiffers,
     ChannelsClipped,
     ChannelsStoodStill,
     ChannelsWrap,
@@ -188,6 +189,9 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     ReadingsRepeat(rank=Rank.INVALIDATES, sensors=A, share=0.6, refresh=20.0, polled=50.0),
     ChannelsStoodStill(rank=Rank.INVALIDATES, channels=("A.X",), constant=(30.0,)),
+    CertificateDiffers(
+        rank=Rank.DELAYS, sensors=("A",), channels=("A.X",), factors=(9.80665,), is_refuted=True
+    ),
     ClocksFitted(rank=Rank.TO_KNOW, sensors=A, ppm=(4.5,), error=2e-6),
     StatedTimesDrift(
         rank=Rank.INVALIDATES,
