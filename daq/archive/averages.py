@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.bench.sensitivity import joined
 from daq.bench.units import canonical
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.estimation.contributions import with_contributions
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from daq.archive.plan import Plan
     from daq.archive.spectra_file import Described
     from daq.bench.channel import Channel
-    from daq.bench.sensitivity import KnownSensitivity
+    from daq.bench.sensitivity import Sensitivities
     from daq.estimation.settings import Settings
 
     ComplexArray = NDArray[np.complex128]
@@ -209,7 +210,7 @@ class Average:
         self.counts = CountLimits()
         self.stood_still: dict[int, float] = {}
         self.shortened: dict[str, tuple[float, float]] = {}
-        self.sensitivities: dict[tuple[str, str], KnownSensitivity] = {}
+        self.sensitivities: Sensitivities = {}
 
     def add(
         self, described: Described, start_utc_ns: int, n_segments: int, csm: ComplexArray
@@ -231,8 +232,7 @@ class Average:
         self.usable = min(self.usable, described.usable)
         self.is_rounded |= described.rounded
         self.caveats = Caveats.joined([self.caveats, described.caveats])
-        for names, known in described.sensitivities.items():
-            self.sensitivities[names] = known.joined(self.sensitivities.get(names, known))
+        self.sensitivities = joined((self.sensitivities, described.sensitivities))
         for sensor, residual in described.residual.items():
             square = self._squares.get(sensor, 0.0)
             self._squares[sensor] = square + n_segments * residual**2

@@ -40,6 +40,9 @@ class KnownSensitivity:
     temperatures : (float, float)
         Lowest and highest temperature of the sensor in °C: those of its readings, or else the
         range of the data sheet.
+    used : (float, float) or ()
+        Smallest and largest sensitivity by which recordings are divided, counts per unit; empty
+        where not known.
     """
 
     own: float = 0.0
@@ -48,11 +51,17 @@ class KnownSensitivity:
     coefficient: float = 0.0
     reference: float = REFERENCE_TEMPERATURE
     temperatures: tuple[float, float] = (REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE)
+    used: tuple[float, ...] = ()
 
     @property
     def is_stated(self) -> bool:
         """Whether certificate or tolerance state an uncertainty."""
         return self.own > 0
+
+    @property
+    def spread(self) -> float:
+        """Relative difference of the sensitivities of recordings."""
+        return (max(self.used) - min(self.used)) / max(map(abs, self.used)) if self.used else 0.0
 
     @property
     def by_temperature(self) -> float:
@@ -67,9 +76,11 @@ class KnownSensitivity:
 
     def joined(self, other: KnownSensitivity) -> KnownSensitivity:
         """Return what both allow."""
-        ends = (*self.temperatures, *other.temperatures)
+        ends, used = (*self.temperatures, *other.temperatures), self.used + other.used
         return replace(
             max(self, other, key=lambda each: each.own),
+            is_certified=self.is_certified and other.is_certified,
+            used=(min(used), max(used)) if used else (),
             coefficient=max(self.coefficient, other.coefficient),
             temperatures=(min(ends), max(ends)),
         )
@@ -91,9 +102,21 @@ def as_document(known: Sensitivities) -> list[tuple[str, str, dict[str, Any]]]:
 def sensitivities_from(document: Iterable[Any]) -> Sensitivities:
     """Return the sensitivities of a document."""
     return {
-        (sensor, channel): KnownSensitivity(**each | {"temperatures": tuple(each["temperatures"])})
+        (sensor, channel): KnownSensitivity(
+            **each
+            | {"temperatures": tuple(each["temperatures"]), "used": tuple(each.get("used", ()))}
+        )
         for sensor, channel, each in document
     }
+
+
+def joined(several: Iterable[Sensitivities]) -> Sensitivities:
+    """Return what all recordings allow."""
+    found: dict[tuple[str, str], KnownSensitivity] = {}
+    for each in several:
+        for names, known in each.items():
+            found[names] = known.joined(found.get(names, known))
+    return found
 
 
 def known_sensitivities(table: Mapping[str, Any]) -> Sensitivities:
@@ -129,4 +152,5 @@ def _known(channel: Mapping[str, Any], sheet: Mapping[str, Any]) -> KnownSensiti
         coefficient=float(sheet.get("temperature_coefficient", 0.0)) if is_for else 0.0,
         reference=reference,
         temperatures=(float(low), float(high)),
+        used=(float(channel["sensitivity"]),) * 2,
     )

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.bench.sensitivity import Sensitivities
+from daq.bench.sensitivity import Sensitivities, joined
 from daq.caveats import Caveats
 from daq.clocks.sensor_reader import main_columns
 from daq.estimation.blas_threads import one_blas_thread
@@ -670,12 +670,11 @@ def sensitivities_at(known: Sensitivities, readings: Iterable[Reading]) -> Sensi
 
 
 def stated_sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitivities:
-    """Return what is known of the sensitivities of recordings, by the bench of the first."""
-    outline = recordings[0].outline
-    if outline is None:
-        return {}
+    """Return what is known of the sensitivities of recordings, by the benches of all."""
+    outlines = [recording.outline for recording in recordings]
+    known = joined(each.sensitivities for each in outlines if each is not None)
     readings = (each for recording in recordings for each in recording.readings)
-    return sensitivities_at(outline.sensitivities, readings)
+    return sensitivities_at(known, readings)
 
 
 def _counting_rates(recording: ReadableRecording) -> dict[str, float]:

@@ -181,6 +181,26 @@ class CertificateDiffers(Fact):
         return Words(f"{text}: correct one of them", f"{text}{why}.{agree}", do)
 
 
+class SensitivitiesDiffer(Fact):
+    """Recordings of one estimate have other sensitivities of `channels`.
+
+    Attributes
+    ----------
+    share : float
+        Largest difference, relative.
+    """
+
+    share: float
+
+    def _words(self) -> Words:
+        text = f"differ between the recordings by {percent(self.share)}"
+        return Words(
+            f"Sensitivities of {few(self.channels)} {text}",
+            f"Sensitivities of {listed(self.channels)} {text}.",
+            "If these sensors did not change, correct the bench file.",
+        )
+
+
 class RoundedAlike(Fact):
     """Channels of several sensors are rounded to counts alike, and share a part of that noise.
 
@@ -277,6 +297,15 @@ def facts_of_channels(snapshot: Snapshot) -> Iterator[Fact]:
             constant=tuple(still.values()),
         )
     yield from _certificates(snapshot)
+    known = {each.name: (each.sensor, each.channel) for each in snapshot.channels}
+    stated = {name: snapshot.sensitivities.get(key) for name, key in known.items()}
+    spread = {name: each.spread for name, each in stated.items() if each and each.spread}
+    if spread:
+        yield SensitivitiesDiffer(
+            rank=Rank.DELAYS if max(spread.values()) > TOLERANCE else Rank.TO_KNOW,
+            channels=tuple(spread),
+            share=max(spread.values()),
+        )
 
 
 def _certificates(snapshot: Snapshot) -> Iterator[CertificateDiffers]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from daq.bench.sensitivity import KnownSensitivity, known_sensitivities
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot_builder import stated_sensitivities
 from daq.formats.arrays import recording_of_arrays
-from daq.results.facts.channels import CertificateDiffers
+from daq.results.facts.channels import CertificateDiffers, SensitivitiesDiffer
 from daq.results.result import Result
 
 RATE, OWN, SNR = 100.0, 0.03, 300.0
@@ -100,3 +102,29 @@ def test_a_certificate_that_contradicts_the_bench_file_is_a_fact(
     facts = [str(each) for each in found.facts if isinstance(each, CertificateDiffers)]
     assert len(facts) == (words is not None)
     assert all(re.search(words or "", each) for each in facts), facts
+
+
+def test_recordings_are_estimated_by_the_sensitivities_and_tolerances_of_all() -> None:
+    def recording(sensitivity: float, **stated: float) -> Any:  # noqa: ANN401 - of a recording
+        channel = {"name": "X", "sensitivity": sensitivity, **stated}
+        known = known_sensitivities({"sensors": [{"name": "A", "channels": [channel]}]})
+        return SimpleNamespace(outline=SimpleNamespace(sensitivities=known), readings=())
+
+    first = recording(1e7)
+    same = stated_sensitivities([first, recording(1e7, tolerance=0.1)])["A", "X"]
+    assert same.own == pytest.approx(0.1 / np.sqrt(3))
+    assert not same.spread
+    none: Any = SimpleNamespace(outline=None, readings=())
+    known = stated_sensitivities([first, recording(1.25e7), none])
+    assert known["A", "X"].spread == pytest.approx(0.2)
+    rng = np.random.default_rng(3)
+    motion = 30 * rng.standard_normal((6000, 1))
+    samples = {name: motion + rng.standard_normal((6000, 1)) for name in "ABC"}
+    settings = Settings(segment=1.0, axis_tolerance={"": 0.0})
+    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
+    label = snapshot.channels[0]
+    named = {(label.sensor, label.channel): known["A", "X"]}
+    facts = Result(with_sensitivities(snapshot, named), settings).facts
+    (fact,) = (each for each in facts if isinstance(each, SensitivitiesDiffer))
+    assert fact.needs_action
+    assert f"{label.name} differ between the recordings by 20 %" in str(fact)

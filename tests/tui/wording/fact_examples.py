@@ -34,6 +34,7 @@ from daq.results.facts.channels import (
     NotLinear,
     ReadingsRepeat,
     RoundedAlike,
+    SensitivitiesDiffer,
 )
 from daq.results.facts.clocks import (
     ClockNotUnderstood,
@@ -189,6 +190,7 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     ReadingsRepeat(rank=Rank.INVALIDATES, sensors=A, share=0.6, refresh=20.0, polled=50.0),
     ChannelsStoodStill(rank=Rank.INVALIDATES, channels=("A.X",), constant=(30.0,)),
+    SensitivitiesDiffer(rank=Rank.DELAYS, channels=("A.X",), share=0.2),
     CertificateDiffers(
         rank=Rank.DELAYS, sensors=("A",), channels=("A.X",), factors=(9.80665,), is_refuted=True
     ),
