@@ -355,8 +355,6 @@ def simulation_of(port: str) -> dict[str, Any]:
     for file in Path(tempfile.gettempdir()).glob("huddle-*/simulated-ports.json"):
         with contextlib.suppress(OSError, ValueError):  # of another user, or just removed
             served = json.loads(file.read_text(encoding="utf-8"))
-            if isinstance(served, list):  # of an earlier version
-                served = {each: {"speed": 1.0} for each in served}
             for each, simulation in served.items():
                 if is_same_port(port, each):
                     return dict(simulation)

@@ -88,10 +88,9 @@ class LedgerEntry:
     by : str
     recordings : tuple of (file, run_id, sha256)
     roots : mapping
-        Root SHA-256 of the manifest of each recording, by run id; none in older ledgers.
-    signer : str or None
-        Id of the key that signs the certificate; empty: not signed; None in older ledgers, which
-        do not know.
+        Root SHA-256 of the manifest of each recording, by run id.
+    signer : str
+        Id of the key that signs the certificate; empty: not signed.
     settings : mapping
         Those of the estimate that differ from the defaults.
     reason : str
@@ -117,7 +116,7 @@ class LedgerEntry:
     file: str = ""
     sha256: str = ""
     roots: Mapping[str, str] = field(default_factory=dict)
-    signer: str | None = None
+    signer: str = ""
     row: int = 0
 
     @property
@@ -472,7 +471,7 @@ def _entry(record: Mapping[str, Any], own: str, state: State) -> LedgerEntry:
         settings=record["settings"],
         reason=record["reason"],
         roots=record.get("roots", {}),
-        signer=record.get("signer"),
+        signer=record.get("signer", ""),
         hash=own,
         state=state,
     )

@@ -134,7 +134,7 @@ class Claims:
     by, entry : str
         Who authorised it, and the hash of its row.
     roots : mapping of str to str
-        Root SHA-256 of each recording by run id; none in certificates of earlier versions.
+        Root SHA-256 of each recording by run id.
     text : str
         Of all pages, without white space.
     """
@@ -170,7 +170,7 @@ class Claims:
                 revision=int(own["revision"]),
                 by=str(own["by"]),
                 entry=str(own["entry"]),
-                roots={str(run): str(root) for run, root in own.get("roots", {}).items()},
+                roots={str(run): str(root) for run, root in own["roots"].items()},
                 text="".join(pages),
             )
         except Exception as error:  # noqa: BLE001 - of a damaged file, pypdf raises anything
@@ -249,8 +249,6 @@ def verify(
         last = ledger.last_of(entry.runs, entries)
         lines.append(f"replaced by revision {last.revision}" if last else "replaced")
     lines.append("number, revision, authoriser and row inside the PDF; SHA-256: as in the ledger")
-    if not claims.roots:
-        lines.append("issued by an earlier version: it does not say of which contents it is")
     return [*lines, *signed, *_recordings(path, entry, recordings, ledger)]
 
 
@@ -282,7 +280,7 @@ def _without_ledger(
         f"certificate {entry.name}, by {entry.by}",
         "no ledger here: a later revision would not be known",
         *signed,
-        *(_recordings(path, entry, recordings, None) if claims.roots else ()),
+        *_recordings(path, entry, recordings, None),
     ]
 
 
@@ -295,7 +293,7 @@ def _against_ledger(
         wrong.append("the ledger has another row for it than the one it names: one was rewritten")
     if claims.by != entry.by:
         wrong.append(f"authorised by {claims.by}, in the ledger by {entry.by}")
-    if claims.roots and dict(claims.roots) != dict(entry.roots):
+    if dict(claims.roots) != dict(entry.roots):
         wrong.append("it is of other contents of the recording than the ledger says")
     if entry.state == "void":
         wrong.append("its number is void")
@@ -316,10 +314,7 @@ def _signatures(content: bytes, entry: LedgerEntry, wanted: str) -> tuple[list[s
             wrong.append(f"its signature, with key {entry.signer}, was removed")
         elif wanted:
             wrong.append("it is not signed")
-        said = "not signed: who can write the folder can write certificate and ledger anew"
-        if entry.signer is None:
-            said += ", and its ledger, of an earlier version, does not say whether it was signed"
-        return [said], wrong
+        return ["not signed: who can write the folder can write certificate and ledger"], wrong
     if find_spec("pyhanko") is None:
         line = f"signature not checked; run: {install_command('sign')}"
         return [line], [line] if wanted else []
@@ -334,7 +329,7 @@ def _signatures(content: bytes, entry: LedgerEntry, wanted: str) -> tuple[list[s
     for each in found:
         if not each.is_intact:
             wrong.append(f"the signature of {each.signer} is not intact, or not of the whole file")
-        if entry.signer is not None and each.key_id != entry.signer:
+        if each.key_id != entry.signer:
             wrong.append(
                 f"signed with key {each.key_id}, in the ledger "
                 + (f"with {entry.signer}" if entry.signer else "not signed")
@@ -352,12 +347,10 @@ def _head(ledger: Ledger, entry: LedgerEntry, wanted: str) -> tuple[list[str], l
     """Return whether the ledger is signed as far as a certificate, and what is wrong with that."""
     if not entry.signer and not wanted:
         return [], []
-    if entry.signer is None:
-        return ["ledger not signed as far as this certificate: of an earlier version"], []
     if find_spec("cryptography") is None:
         return [f"signature of the ledger not checked; run: {install_command('sign')}"], []
     rows = ledger.signed_rows()
-    key_id = wanted or entry.signer or ""
+    key_id = wanted or entry.signer
     if rows.get(key_id, 0) < entry.row:
         return [], [f"the ledger is not signed with key {key_id} as far as this certificate"]
     return [f"ledger signed with key {key_id} as far as this certificate"], []

@@ -45,7 +45,6 @@ from tui.application.test_view.units import units_of
 from tui.certificate.ledger import LedgerEntry, LedgerError
 from tui.output.json_values import json_text
 from tui.output.results import averages_line, curves_csv
-from tui.service.records.places import file_name
 from tui.web.access import (
     Access,
     Ended,
@@ -251,8 +250,6 @@ class Server:
     ) -> None:
         self._controls, self._bench, self._web = controls, bench, web
         self._check = check
-        for path in bench.recording_directory.glob(f".{file_name(bench.name)}.web-key"):
-            path.unlink()  # of an earlier version: who reads the recordings could log in with it
         key = server_key(state_path(bench, "key"))
         self._access = Access(web, key, Ended(state_path(bench, "ended")))
         self._n_streams: Counter[str] = Counter()

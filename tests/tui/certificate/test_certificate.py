@@ -415,7 +415,7 @@ def test_recordings_are_compared_with_their_certificates(copied: Laboratory) -> 
     """Results may be stored later; nothing else may change, whatever checksums are rewritten."""
     certificate, recording = copied.certificate(), copied.recording
     said = copied.verify(certificate)
-    assert "not signed: who can write the folder can write certificate and ledger anew" in said
+    assert "not signed: who can write the folder can write certificate and ledger" in said
     assert f"recording {recording}: the one certified, unchanged" in said  # it is beside
     said = copied.verify(recording)
     assert said.endswith(f"certified by {Ledger(copied.certificates).entries()[0].name}")

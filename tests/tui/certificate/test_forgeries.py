@@ -25,7 +25,6 @@ from pypdf.generic import ContentStream, NameObject
 
 from tests.traced_memory import peak_of
 from tests.tui.certificate.laboratory import Laboratory, key, laboratory, rescale
-from tui.certificate import issuing
 from tui.certificate.ledger import NAME, Ledger
 from tui.certificate.signing import PdfSignature, Signer, signatures
 from tui.certificate.verification import JSON_NAME, Claims, VerificationError, _signatures, verify
@@ -387,39 +386,6 @@ def test_another_laboratory_of_the_same_name_does_not_have_the_key(
     said = forged.lab.verify(path, "--key", missing, code=2)
     assert str(missing) in "".join(said.split())
     assert "no public key" in forged.lab.verify(path, "--key", forged.lab.bench, code=2)
-
-
-def test_a_ledger_of_an_earlier_version_is_read_and_says_what_it_cannot_prove(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Rows had no signer, certificates no roots, and there were no signed heads."""
-    made, add = laboratory(tmp_path / "lab"), Ledger._add  # noqa: SLF001 - to write as before
-
-    def as_before(self: Ledger, record: dict[str, Any], signer: None = None) -> str:
-        return add(self, {k: v for k, v in record.items() if k != "signer"}, signer)
-
-    def without_roots(*arguments: Any) -> bytes:  # noqa: ANN401 - as it takes them
-        document = json.loads(result(*arguments))
-        del document["certificate"]["roots"]
-        return json.dumps(document).encode()
-
-    result = issuing._result  # noqa: SLF001 - as above
-    with monkeypatch.context() as patch:
-        patch.setattr(Ledger, "_add", as_before)
-        patch.setattr(issuing, "_result", without_roots)
-        made.issue()
-    with closing(sqlite3.connect(made.certificates / NAME)) as rows:
-        rows.executescript("DROP TABLE heads;")
-    path = made.certificate()
-    said = made.verify(path, made.recording)
-    assert "issued by an earlier version: it does not say of which contents it is" in said
-    assert "of an earlier version, does not say whether it was signed" in said
-    private = key(tmp_path / "lab.p12", SECRET.encode())
-    monkeypatch.setenv("HUDDLE_PASSPHRASE", SECRET)
-    made.issue("--reason", "now signed", "--sign", str(private))
-    public = exported(private)
-    made.verify(made.certificate(1), "--key", public)
-    assert "it is not signed" in made.verify(path, "--key", public, code=3)
 
 
 def test_who_has_the_key_and_no_ledger_verifies_the_signature(

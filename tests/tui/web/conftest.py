@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
 
-from tests.tui.web.pages import OLD_KEY, SECRETS, Server, bench_file, serving
+from tests.tui.web.pages import SECRETS, Server, bench_file, serving
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,10 +38,9 @@ def server(folder: Path) -> Iterator[Server]:
 
 @pytest.fixture(scope="module")
 def closed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Serve with secrets, where an earlier version left its key."""
+    """Serve with secrets."""
     folder = tmp_path_factory.mktemp("closed")
     bench = bench_file(folder, SECRETS)
-    (folder / OLD_KEY).write_bytes(b"x" * 32)
     with serving(bench) as found:
         yield found
 

@@ -39,7 +39,6 @@ SECRETS = f"""
 read = "{token_hash(READER)}"
 steer = "{STEERER_HASH}"
 """
-OLD_KEY = "recordings/.cellar--b-.web-key"
 
 
 def bench_file(folder: Path, web: str = "") -> Path:

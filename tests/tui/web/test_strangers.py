@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from daq.bench.tables.unattended import Web
 from daq.devices.bench_file import load
-from tests.tui.web.pages import OLD_KEY, READER, SECRETS, STEERER, Server, bench_file, serving
+from tests.tui.web.pages import READER, SECRETS, STEERER, Server, bench_file, serving
 from tests.tui.web.strangers import fuzzed
 from tests.waiting import limit, wait_until
 from tui.application.controls import Controls
@@ -332,7 +332,6 @@ def _fuzz(server: Server, n: int) -> None:
 
 def test_the_key_of_cookies_is_not_among_recordings(closed: Server) -> None:
     folder = closed.log.parent
-    assert not (folder / OLD_KEY).exists()
     (key,) = (folder / "state").rglob("*.key")
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
 

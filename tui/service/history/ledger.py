@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daq.bench.units import decibels
-from daq.caveats import Caveat, Caveats
+from daq.caveats import Caveats
 from daq.errors import HuddleError
 from daq.recording.reader import Recording
 from daq.results.band_summary import CONSTANT, known_range
@@ -65,13 +65,13 @@ _ENDS = (
     " AND method = ? AND low_hz = ? AND high_hz = ? AND started IN (?, ?) ORDER BY started"
 )
 _OF_SENSOR = (
-    f"SELECT bench, noise.started, noise.{{caveats}}, {_NOISE} FROM noise JOIN tests"  # noqa: S608
+    f"SELECT bench, noise.started, noise.caveats, {_NOISE} FROM noise JOIN tests"  # noqa: S608
     " USING (run_id) WHERE serial_number = ? ORDER BY noise.started"
 )
 
 _TESTS = (
-    "SELECT started, bench, recording, sensor, model, {firmware}, temperature, sensitivities,"
-    " limits, tests.{caveats} FROM sensors JOIN tests USING (run_id) WHERE serial_number = ?"
+    "SELECT started, bench, recording, sensor, model, firmware, temperature, sensitivities,"
+    " limits, tests.caveats FROM sensors JOIN tests USING (run_id) WHERE serial_number = ?"
     " ORDER BY started"
 )
 
@@ -215,7 +215,6 @@ def record_test(path: Path, result: Result) -> list[Drift]:
         ledger.executescript(_TABLES)
         with ledger:  # all of a test, or nothing
             ledger.execute("BEGIN IMMEDIATE")
-            _bring_up_to_date(ledger)
             added = ledger.execute("INSERT OR IGNORE INTO tests VALUES (?, ?, ?, ?, ?)", test)
             if added.rowcount:
                 ledger.executemany("INSERT INTO sensors VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
@@ -224,18 +223,6 @@ def record_test(path: Path, result: Result) -> list[Drift]:
             _drift(ledger, name, (serial, started, caveats)) for name, (_, serial) in about.items()
         ]
     return [each for each in found if each is not None]
-
-
-def _bring_up_to_date(ledger: sqlite3.Connection) -> None:
-    """Give the tables of earlier versions the columns that they had not."""
-    if "firmware" not in _columns(ledger, "sensors"):
-        ledger.execute("ALTER TABLE sensors ADD COLUMN firmware TEXT")
-    for table in ("tests", "noise"):
-        if "simulated" in _columns(ledger, table):  # 0 or 1
-            ledger.execute(f"ALTER TABLE {table} RENAME COLUMN simulated TO caveats")
-            ledger.execute(
-                f"UPDATE {table} SET caveats = CASE caveats WHEN 0 THEN '' ELSE 'simulated' END"  # noqa: S608
-            )
 
 
 def _sensor_row(run_id: str, each: SensorRecord, verdict: TestVerdict | None) -> tuple[Any, ...]:
@@ -288,15 +275,7 @@ def _rows(question: str, serial_number: str) -> list[Any]:
     if place is None or not place.exists():
         return []
     with closing(sqlite3.connect(f"{place.resolve().as_uri()}?mode=ro", uri=True)) as ledger:
-        firmware = "firmware" if "firmware" in _columns(ledger, "sensors") else "NULL"
-        caveats = "caveats" if "caveats" in _columns(ledger, "tests") else "simulated"
-        question = question.format(firmware=firmware, caveats=caveats)
         return ledger.execute(question, (serial_number,)).fetchall()
-
-
-def _columns(ledger: sqlite3.Connection, table: str) -> list[str]:
-    """Return the columns of a table, of which earlier versions had others."""
-    return [row[1] for row in ledger.execute(f"PRAGMA table_info({table})")]
 
 
 def sensor_tests(serial_number: str) -> list[SensorTest]:
@@ -324,10 +303,8 @@ def sensor_tests(serial_number: str) -> list[SensorTest]:
     return [each for each in found if bool(each.caveats) is all_have]
 
 
-def _caveats(names: str | int) -> Caveats:
-    """Return caveats by their names; 0 or 1 are of ledgers that named none but simulation."""
-    if isinstance(names, int):
-        return Caveats.of({Caveat.SIMULATED: names})
+def _caveats(names: str) -> Caveats:
+    """Return caveats by their names."""
     return Caveats.of(dict.fromkeys(names.split(", "), True))
 
 
