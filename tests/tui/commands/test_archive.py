@@ -98,9 +98,14 @@ def test_the_archive_beside_the_recordings_answers_what_the_estimate_says(
     wanted = json.loads(direct.stdout)
     assert found["pooled"]["segments"] == wanted["segments"]
     for one, other in zip(found["pooled"]["channels"], wanted["channels"], strict=True):
-        for key in ("noise_psd", "noise_psd_low", "noise_psd_high"):
-            a, b = (np.array(each[key], dtype=float) for each in (one, other))
-            np.testing.assert_allclose(a, b, rtol=1e-9)
+        psd, low, high = (
+            np.array([each[key] for each in (one, other)], dtype=float)
+            for key in ("noise_psd", "noise_psd_low", "noise_psd_high")
+        )
+        np.testing.assert_allclose(psd[0], psd[1], rtol=1e-9)
+        wider = np.stack([low[1] - low[0], high[0] - high[1]]) / psd[1]
+        assert np.nanmin(wider) > -1e-9  # by what stretches estimated alone scatter
+        assert np.nanmax(wider) < 0.1
     validate("archive-2", found)
     assert found["days"]["date"] == ["2026-08-31", "2026-09-01"]
     assert np.shape(found["days"]["noise_psd"]) == (2, len(found["bands_hz"]), 6)

@@ -82,9 +82,10 @@ class RecordedNoise:
 
     @classmethod
     def of(cls, *values: Any) -> RecordedNoise:  # noqa: ANN401 - of the fields, in order
-        """Return it from the fields in order; numbers that are None are not known."""
-        numbers = (math.nan if value is None else float(value) for value in values[-3:])
-        return cls(*values[:-3], *numbers)
+        """Return it from the fields in order; numbers that are None are not known, or no end."""
+        unknown = (math.nan,) * 3 if values[-3] is None else (math.nan, -math.inf, math.inf)
+        numbers = zip(values[-3:], unknown, strict=True)
+        return cls(*values[:-3], *(none if value is None else value for value, none in numbers))
 
 
 @dataclass(frozen=True, slots=True)
