@@ -112,6 +112,7 @@ class _Truth:
             n_segments=np.full(24, n, np.int64),
             noise=hours.astype(np.float32),
             recorded=recorded.astype(np.float32),
+            changed=np.zeros_like(hours, np.float32),
             days=days,
             day_segments=np.array([24 * n], np.int64),
             levels=row[:, None].astype(np.float32),

@@ -242,7 +242,11 @@ class Years:
             else:
                 rows = (row for row in file.rows() if month_of(row[0]) == month)
                 about = replace(described, rounded=file.is_single)
-                made = summaries(rows, about, self._plan, self._settings)
+                changed: dict[int, FloatArray] = {}
+                if month in file.months:
+                    kept = file.summary(month)
+                    changed = dict(zip(kept.starts.tolist(), kept.changed, strict=True))
+                made = summaries(rows, about, self._plan, self._settings, changed)
                 found = next(summary for _, summary in made)
                 if file.is_daily:
                     found = found.of_days
@@ -308,7 +312,7 @@ def _write_totals(hdf5: WholeHdf5) -> None:
     for name in ("noise", "recorded"):
         total = reduce(add, (density_of(month[name]) for month in months))
         _write_density(hdf5, name, total)
-    for name in ("total", "alone", "alone_segments"):
+    for name in ("total", "alone", "alone_segments", "untested"):
         hdf5.create(name, reduce(add, (month[name][...] for month in months)))
     hdf5.file.attrs["n_segments"] = sum(int(month.attrs["n_segments"]) for month in months)
 
@@ -357,6 +361,8 @@ class Answer:
         Noise of every day in these, in unit²/Hz.
     problems : tuple of str
         What could not be read.
+    untested : int
+        Segments of stretches in which changes of responses are not tested.
     doubted : tuple of Described
         Of recordings that are left out, because the clock of a sensor is not understood.
     lacking : mapping of str to int
@@ -377,6 +383,7 @@ class Answer:
     fine_hz: FloatArray
     spectrogram: NDArray[np.float32]
     problems: tuple[str, ...]
+    untested: int
     doubted: tuple[spectra_file.Described, ...]
     lacking: Mapping[str, int]
 
@@ -440,10 +447,11 @@ def answer(
     ends = every.welch.lowest, usable
     tally = _Tally(years.grid, _bands(settings, years.grid.frequency, *ends))
     usual = _bands(plan.noise_settings(settings), years.grid.frequency, *ends)
-    pooled, lacking, alone = Average(), Counter[int](), np.zeros((2, 1, 1))
+    pooled, lacking, alone, untested = Average(), Counter[int](), np.zeros((2, 1, 1)), 0
     for file in years.each([years.grid.span(band) for band in usual]):
         pooled.add_sum(spectra_file.unpacked(file["total"][...]), int(file.attrs["n_segments"]))
         alone = alone + np.stack([file["alone"][...], file["alone_segments"][...]])
+        untested += int(file["untested"][0])
         tally.take(file)
     for entry in known:
         if entry.described.origin.run_id not in years.damaged:
@@ -490,6 +498,7 @@ def answer(
         fine_hz=years.grid.frequency[years.grid.edges],
         spectrogram=tally.of_all("noise"),
         problems=tuple(years.problems),
+        untested=untested,
         doubted=doubted,
         lacking={snapshot.channels[column].name: lacking[column] for column in sorted(lacking)},
     )

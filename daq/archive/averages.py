@@ -12,7 +12,7 @@ import numpy as np
 from daq.bench.sensitivity import joined
 from daq.bench.units import canonical
 from daq.caveats import NO_CAVEATS, Caveats
-from daq.estimation.contributions import with_contributions
+from daq.estimation.contributions import left_by_changes, with_contributions
 from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
 from daq.estimation.equalisation import Equalisation
 from daq.estimation.noise_estimates import (
@@ -30,6 +30,7 @@ from daq.estimation.snapshot_diagnostics import (
 from estimator.checks.count_limits import CountLimits
 from estimator.errors import InsufficientDataError
 from estimator.spectra.multiresolution import Band
+from estimator.spectra.parts import Parts
 from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import WelchSettings, scale
 from estimator.spectra.windows import effective_averages, get_window
@@ -44,8 +45,10 @@ if TYPE_CHECKING:
     from daq.bench.channel import Channel
     from daq.bench.sensitivity import Sensitivities
     from daq.estimation.settings import Settings
+    from estimator.spectra.welch import CrossSpectra
 
     ComplexArray = NDArray[np.complex128]
+    FloatArray = NDArray[np.float64]
     Channels = tuple[tuple[str, Channel], ...]
 
 
@@ -97,6 +100,27 @@ class Estimator:
         with np.errstate(invalid="ignore", divide="ignore"):
             found = own / first
         return None if np.all((own == first) | (own == 0)) else found
+
+    def left_by_changes(self, spectra: CrossSpectra, place: int, usable: float) -> FloatArray:
+        """Return the share of the noise that responses which change may leave of the motion.
+
+        Of `spectra` with parts of time, which end at `place`, and are known up to `usable` Hz.
+        Shape (n_freqs, n_channels): negative where noise may be too low, NaN where it is not known.
+        """
+        unknown = np.full((len(self.welch.frequencies), len(self.channels)), np.nan)
+        if spectra.ends is None:
+            return unknown
+        bins, n_effective = spectra.ends.bins, spectra.n_effective
+        frequency, csm = self.welch.frequencies[bins], spectra.csm()[bins]
+        parts = Parts(np.arange(len(bins)), spectra.parts(place))
+        band = Band(self.welch, frequency, csm, spectra.n_segments, n_effective, parts=parts)
+        band = in_units(known_part(band, usable), self.channels, self.unit)
+        found, _ = diagnosis((band,), self.dims, self.channels)
+        if found is None or found.stability is None:
+            return unknown
+        share = left_by_changes(replace(found.stability, steadied=()), frequency)
+        nearest = np.searchsorted(bins, np.arange(len(unknown)))
+        return np.asarray(share[np.minimum(nearest, len(bins) - 1)])
 
     def snapshot(
         self, average: Average, *, diagnose: bool = False, curves_only: bool = False

@@ -45,7 +45,7 @@ class RecordingsLeftOut(Fact):
 
 
 class ResponsesVary(Fact):
-    """Noise of `channels` from all spectra is more than that of stretches estimated alone.
+    """Noise of `channels` from all spectra is more than that of steady parts.
 
     Attributes
     ----------
@@ -58,11 +58,23 @@ class ResponsesVary(Fact):
     def _words(self) -> Words:
         much = f"up to {percent(self.share)} of it is motion"
         return Words(
-            f"Responses change: noise of {few(list(self.channels))}, {much}; take that by day",
+            f"Responses change: noise of {few(list(self.channels))}, {much}; take steady days",
             f"The noise of {listed(self.channels)} from all spectra together is more than that of"
-            f" stretches estimated alone: {much}, as responses change between them.",
-            "Take the noise by day, and let sensors settle.",
+            f" steady parts of time: {much}, as responses change within or between stretches.",
+            "Take days or recordings in which responses are steady, and let sensors settle.",
         )
+
+
+class ChangesNotTested(Fact):
+    """Whether responses change within stretches is not tested in `n_segments`."""
+
+    n_segments: int
+
+    def _words(self) -> Words:
+        number = several(self.n_segments, "segment")
+        text = f"Changes of responses within stretches are not tested in {number}"
+        why = "parts of these stretches are too short, or an earlier version took them"
+        return Words(text, f"{text}: {why}.")
 
 
 class SpectraUnreadable(Fact):
@@ -163,6 +175,8 @@ def facts_of_archive(found: Answer) -> Iterator[Fact]:
     if not any(each.decided for each in found.courses):
         n_days = len(found.days_utc_ns)
         yield ChangesUndecided(rank=Rank.DELAYS, n_days=n_days, needed=MIN_DAYS)
+    if found.untested:
+        yield ChangesNotTested(rank=Rank.TO_KNOW, n_segments=found.untested)
     if found.lacking:
         channels, n_segments = tuple(found.lacking), tuple(found.lacking.values())
         yield AbsencesNotUsed(rank=Rank.TO_KNOW, channels=channels, n_segments=n_segments)

@@ -29,7 +29,7 @@ from estimator.levels.contributions import Contribution, Source, deviation
 from estimator.levels.interval import NORMAL_95, like_psd
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     import h5py
     from numpy.typing import NDArray
@@ -284,6 +284,7 @@ def summaries(
     described: Described,
     plan: Plan,
     settings: Settings,
+    changed: Mapping[int, FloatArray],
 ) -> Iterator[tuple[str, Summary]]:
     """Yield the summaries of a recording, each with its month.
 
@@ -295,10 +296,12 @@ def summaries(
     plan : Plan
     settings : Settings
         Of the noise; its first method counts.
+    changed : mapping of int to float64 array, shape (n_fine, n_channels)
+        `Summary.changed` of stretches, by their beginning; where it is known.
     """
     estimator = Estimator(plan, settings, described.channels)
     for month, some in groupby(rows, lambda row: month_of(row[0])):
-        making = _Making(estimator, described)
+        making = _Making(estimator, described, changed)
         for row in some:
             making.take(*row)
         yield month, making.made()
@@ -307,10 +310,12 @@ def summaries(
 class _Making:
     """A summary, while stretches come."""
 
-    def __init__(self, estimator: Estimator, described: Described) -> None:
-        self._estimator, self._described = estimator, described
+    def __init__(
+        self, estimator: Estimator, described: Described, changed: Mapping[int, FloatArray]
+    ) -> None:
+        self._estimator, self._described, self._changed = estimator, described, changed
         self._grid = Grid.of(estimator)
-        self._stretches: list[tuple[int, int, FloatArray, FloatArray]] = []
+        self._stretches: list[tuple[int, int, FloatArray, FloatArray, FloatArray]] = []
         self._days: list[tuple[int, int, FloatArray]] = []
         self._day, self._begin = Average(), 0
         self._total: ComplexArray = np.zeros(1, np.complex128)
@@ -330,7 +335,8 @@ class _Making:
         noise = np.full(recorded.shape, np.nan)
         if result is not None:
             noise = self._grid.mean(result.noise_psd)
-        self._stretches.append((start, n_segments, noise, recorded))
+        changed = self._changed.get(start, np.full(recorded.shape, np.nan))
+        self._stretches.append((start, n_segments, noise, recorded, changed))
 
     def _end_day(self) -> None:
         snapshot = self._estimator.snapshot(self._day)
@@ -361,20 +367,22 @@ class _Making:
     def _more_than_alone(self, noise: FloatArray) -> FloatArray:
         """Return what the noise of the day has over that of its stretches, each estimated alone."""
         own = [each for each in self._stretches if each[0] >= self._begin]
-        total, count = summed(np.stack([o[2] for o in own]), np.array([o[1] for o in own]))
+        alone = [noise_alone(noise, changed) for _, _, noise, _, changed in own]
+        total, count = summed(np.stack(alone), np.array([o[1] for o in own]))
         with np.errstate(invalid="ignore"):
             return self._grid.more(noise, total / count)
 
     def made(self) -> Summary:
         """Return the summary."""
         self._end_day()
-        starts, n_segments, noise, recorded = zip(*self._stretches, strict=True)
+        starts, n_segments, noise, recorded, changed = zip(*self._stretches, strict=True)
         days, day_segments, rows = zip(*self._days, strict=True)
         return Summary(
             np.array(starts, np.int64),
             np.array(n_segments, np.int64),
             np.array(noise, np.float32),
             np.array(recorded, np.float32),
+            np.array(changed, np.float32),
             np.array(days, np.int64),
             np.array(day_segments, np.int64),
             np.stack(rows, axis=1).astype(np.float32),
@@ -397,7 +405,10 @@ class Rollup:
     part_noise : float32, shape (n_local, 3, n_fine, n_channels)
     noise, recorded : Density
     alone, alone_segments : float64, shape (n_fine, n_channels)
-        Noise of stretches, each estimated alone, times their segments; and these segments.
+        Noise of stretches, each estimated alone, without what changes of responses within it may
+        leave of the motion, times their segments; and these segments.
+    untested : int64, shape (1,)
+        Segments of stretches in which such changes are not tested.
     total : complex128
         In the units of the archive's first recording.
     n_segments : int
@@ -414,6 +425,7 @@ class Rollup:
     recorded: Density
     alone: FloatArray
     alone_segments: FloatArray
+    untested: IntArray
     total: ComplexArray
     n_segments: int
 
@@ -521,11 +533,15 @@ def rolled_up(
         with np.errstate(invalid="ignore", divide="ignore"):
             parts[row] = local[ordinal][1] / segments[row][:, None, None]
     alone = [
-        summed(each.noise, each.n_segments)
+        summed(noise_alone(each.noise, each.changed), each.n_segments)
         if len(each.starts)
         else summed(each.levels[MEAN], each.day_segments)
         for each in found
     ]
+    tested = sum(
+        int(each.n_segments[np.isfinite(each.changed).any(axis=(1, 2))].sum()) for each in found
+    )
+    n_segments = int(sum(each.day_segments.sum() for each in found))
     return Rollup(
         days=days,
         day_segments=day_segments,
@@ -537,9 +553,15 @@ def rolled_up(
         recorded=recorded,
         alone=np.sum([noise for noise, _ in alone], axis=0),
         alone_segments=np.sum([count for _, count in alone], axis=0),
+        untested=np.array([n_segments - tested]),
         total=np.sum([each.total for each in found], axis=0),
-        n_segments=int(sum(each.day_segments.sum() for each in found)),
+        n_segments=n_segments,
     )
+
+
+def noise_alone(noise: FloatArray | SmallArray, changed: FloatArray | SmallArray) -> FloatArray:
+    """Return noise without what changes of responses may leave in it; all where not tested."""
+    return np.asarray(noise * (1 - np.minimum(np.nan_to_num(changed), 1.0)), np.float64)
 
 
 def summed(noise: FloatArray | SmallArray, n_segments: IntArray) -> tuple[FloatArray, FloatArray]:

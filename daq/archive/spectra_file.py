@@ -43,7 +43,7 @@ SmallArray = NDArray[np.float32]
 FORMAT = "huddle-archive-spectra"
 FORMAT_VERSION = 2
 """1: without summaries."""
-SUMMARY_VERSION = 3
+SUMMARY_VERSION = 4
 """Summaries of another version are made again."""
 DAY_NS = 86400 * 10**9
 STRETCH_DTYPE = np.dtype([("start_utc_ns", "<i8"), ("n_segments", "<i8")])
@@ -138,6 +138,9 @@ class Summary:
         Beginning in ns of UTC.
     noise, recorded : float32, shape (n_stretches, n_fine, n_channels)
         NaN where a stretch gives no estimate.
+    changed : float32, shape (n_stretches, n_fine, n_channels)
+        Share of the noise that changes of responses within a stretch may leave of the motion;
+        NaN where that is not tested, or not kept by an earlier version.
     days, day_segments : int64, shape (n_days,)
     levels : float32, shape (N_FIELDS, n_days, n_fine, n_channels)
     total : complex128, shape (n_freqs, n_channels, n_channels)
@@ -148,6 +151,7 @@ class Summary:
     n_segments: IntArray
     noise: SmallArray
     recorded: SmallArray
+    changed: SmallArray
     days: IntArray
     day_segments: IntArray
     levels: SmallArray
@@ -163,6 +167,7 @@ class Summary:
             n_segments=self.n_segments[none],
             noise=self.noise[none],
             recorded=self.recorded[none],
+            changed=self.changed[none],
         )
 
     @property
@@ -419,8 +424,11 @@ class SpectraFile:
         """
         with _damage_named(self.path):
             group = member(member(self._file, "months"), month)
-            names = (each.name for each in fields(Summary) if each.name != "total")
+            names = (each.name for each in fields(Summary) if each.name not in {"total", "changed"})
             arrays = {name: dataset(group, name)[...] for name in names}
+            arrays["changed"] = np.full_like(arrays["noise"], np.nan)
+            if "changed" in group:  # since it is tested
+                arrays["changed"] = dataset(group, "changed")[...]
             total = None if self.is_daily else unpacked(dataset(group, "total")[...])
         if total is None:
             days = set(arrays["days"].tolist())

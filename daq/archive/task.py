@@ -12,9 +12,10 @@ days, and the station is summed up: so the reduction is a tree, whose branches a
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from daq.archive.answers import answer
 from daq.archive.averages import Estimator
 from daq.archive.plan import Plan, settings_from
-from daq.archive.rollup import summaries
+from daq.archive.rollup import Grid, summaries
 from daq.archive.spectra_file import DAY_NS, Described, Origin, SpectraWriter
 from daq.archive.store import Store
 from daq.archive.waveforms import OpenDay
@@ -43,10 +44,15 @@ from daq.estimation.snapshot_builder import stated_sensitivities
 from daq.recording.interface import ReadableRecording
 from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
+from estimator.spectra.parts import MOST, PieceEnds, part_bins
 from estimator.spectra.segment_rejection import Reason
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+PARTS = MOST // 2
+"""Of a stretch, in which responses may change; where pieces are small, up to twice as many."""
+BINS = 96
+"""Frequencies at which that is tested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +206,7 @@ def _written(
         plan.check_fits(each)
         each.doubt_stated_times()
         each.finish()
-        each.end_stretch(last=True)
+        each.end_stretch()
         left_out = dict(each.left_out)
         left_out[Reason.TRANSIENT] = each.n_seen - each.n_written - sum(left_out.values())
         channels = each.aligned.channels
@@ -221,9 +227,8 @@ def _written(
             shortened=each.aligned.shortened,
             sensitivities=stated_sensitivities([recording]),
         )
-        writer.commit(
-            described, summaries(writer.rows(), described, plan, plan.noise_settings(settings))
-        )
+        noise = plan.noise_settings(settings)
+        writer.commit(described, summaries(writer.rows(), described, plan, noise, each.changed))
         return Outcome(task.source, each.n_stretches, each.n_written, origin.closed)
 
 
@@ -296,7 +301,7 @@ class StretchPass(Pass):
         writer: SpectraWriter,
         day_ns: int | None = None,
     ) -> None:
-        self._writer = writer
+        self._writer, self._plan = writer, plan
         self._stretch_ns = plan.stretch_s * 10**9
         self._day_ns = day_ns
         super().__init__(recording, plan.settings)
@@ -308,13 +313,37 @@ class StretchPass(Pass):
         self.drain(last=False)
         self._writer.restart()
         self._number: int | None = None
+        self.changed: dict[int, FloatArray] = {}
+        """`daq.archive.spectra_file.Summary.changed` of every stretch, by its beginning."""
         self.n_stretches = self.n_written = 0
 
-    def end_stretch(self, *, last: bool = False) -> None:
-        """Write the stretch that is being summed, if it has a segment."""
-        spectra = self.drain(last=last)
+    @property
+    def _places(self) -> int:
+        """Segments of a stretch, or of a recording that is shorter."""
+        per_ns = self.welch.sampling_rate * 1e-9 / self.welch.hop
+        return min(math.ceil(self._stretch_ns * per_ns), self.n_complete)
+
+    @property
+    def _at_once(self) -> int:
+        return max(1, min(super()._at_once, self._places // MOST))
+
+    @cached_property
+    def _estimator(self) -> tuple[Estimator, Grid]:
+        settings = self._plan.noise_settings(self._plan.settings)
+        estimator = Estimator(self._plan, settings, self.aligned.channels)
+        return estimator, Grid.of(estimator)
+
+    def end_stretch(self, place: int | None = None) -> None:
+        """Write what is summed, if it has a segment; `place` is the next one, None at the end."""
+        bins = part_bins(len(self.welch.frequencies), self.n_channels, BINS)
+        end = self.n_seen if place is None else place
+        ends = PieceEnds(bins, -(-self._places // PARTS), end)
+        spectra = self.drain(last=place is None, ends=ends)
         if spectra.n_segments and self._number is not None:
-            self._writer.append(self._number * self._stretch_ns, spectra.n_segments, spectra.csm())
+            start, (estimator, grid) = self._number * self._stretch_ns, self._estimator
+            share = estimator.left_by_changes(spectra, end, self.aligned.usable)
+            self.changed[start] = grid.mean(share)
+            self._writer.append(start, spectra.n_segments, spectra.csm())
             self.n_stretches += 1
             self.n_written += spectra.n_segments
 
@@ -341,7 +370,10 @@ class StretchPass(Pass):
             first = self._day_ns // self._stretch_ns
             numbers = np.clip(numbers, first, first + DAY_NS // self._stretch_ns - 1)
         for number in np.unique(numbers):
-            if self._number is not None and number != self._number:
-                self.end_stretch()
+            own = numbers == number
+            place = int(begins[own][0]) // self.welch.hop
+            if number != self._number:
+                self.end_stretch(place)
             self._number = int(number)
-            yield numbers == number
+            self.end_part(place)
+            yield own

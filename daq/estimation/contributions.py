@@ -15,7 +15,9 @@ from estimator.checks.advice import Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.advice_on_signals import NoSharedMotion
+from estimator.checks.band_steadiness import ADDED
 from estimator.checks.counts import MARGIN
+from estimator.checks.stability import Stability
 from estimator.checks.steadied import MARGIN as WITHIN
 from estimator.levels.contributions import (
     Contribution,
@@ -216,18 +218,27 @@ def _gusts(snapshot: Snapshot, shape: tuple[int, int]) -> Iterator[Contribution]
 def _changes(snapshot: Snapshot, psd: FloatArray) -> list[Contribution]:
     """Return what responses that change leave of the motion in the noise."""
     if (more := snapshot.between) is not None:
-        below, above = np.maximum(more, 0.0), np.maximum(-more, 0.0)
+        unseen = np.where(more > ADDED * psd, ADDED * (psd - more), 0.0)  # within stretches
+        below, above = np.maximum(more + unseen, 0.0), np.maximum(-more, 0.0)
         return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
     if steady is None:
         return []
-    share, within = steady.changed_at(snapshot.frequency)
+    share = left_by_changes(steady, snapshot.frequency)
     if not share.any():
         return []
-    share = np.where(within, share, np.where(share > MUCH_CHANGED, 1.0, WITHIN * share))
     below, above = psd * np.clip(share, 0.0, 1.0), psd * np.maximum(-share, 0.0)
     return [contribution(Source.CHANGES, psd.shape, below=below, above=above)]
+
+
+def left_by_changes(steady: Stability, frequency: FloatArray) -> FloatArray:
+    """Return the share of the noise that responses which change may leave of the motion.
+
+    Shape (n_freqs, n_channels); negative where the noise may be too low.
+    """
+    share, within = steady.changed_at(frequency)
+    return np.where(within, share, np.where(share > MUCH_CHANGED, 1.0, WITHIN * share))
 
 
 def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:

@@ -12,6 +12,7 @@ costs a pass no product. In float64 the difference is as exact as the sum.
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -35,19 +36,21 @@ def lower_triangle(n: int) -> BoolArray:
     return np.tri(n, dtype=np.bool_)
 
 
-def part_bins(n_freqs: int, n_channels: int) -> IntArray:
+def part_bins(n_freqs: int, n_channels: int, most: int = VALUES) -> IntArray:
     """Return the frequencies that are kept in parts: all of them where they fit.
 
     Parameters
     ----------
     n_freqs, n_channels : int
+    most : int
+        Frequencies at most.
 
     Returns
     -------
     int64, shape (n_kept,)
         Ascending; of many frequencies with a constant ratio where they are distinct.
     """
-    room = max(LEAST_BINS, VALUES // (MOST * n_channels**2))
+    room = min(most, max(LEAST_BINS, VALUES // (MOST * n_channels**2)))
     if room >= n_freqs:
         return np.arange(n_freqs)
     wanted, most = room, n_freqs - 1
@@ -241,6 +244,27 @@ class PartEnds:
         if len(found) > 1 and found[-1][0] - found[-2][0] < self.every / 2:
             del found[-2]
         return found
+
+
+class PieceEnds(PartEnds):
+    """Sums at the ends of parts that end where pieces do; `first` is the place of the first one."""
+
+    def __init__(self, bins: IntArray, every: int, first: int) -> None:
+        super().__init__(bins, every)
+        self._first = first
+
+    @property
+    def upcoming(self) -> int:
+        """No place: `is_due` tells."""
+        return sys.maxsize
+
+    def is_due(self, place: int) -> bool:
+        """Whether a part is to end before a piece that begins at this place."""
+        return 2 * (place - (self._ends[-1][0] if self._ends else self._first)) > self.every
+
+    def end(self, place: int, count: int, total: FloatArray) -> None:
+        """End a part."""
+        self._ends.append((place, count, total[self.bins]))
 
 
 class _Sums(Protocol):

@@ -234,13 +234,13 @@ class SelectedSpectra:
         """End a part of time before this place of the segments."""
         self._accepted.end_part(place)
 
-    def drain(self) -> CrossSpectra:
+    def drain(self, ends: PartEnds | None = None) -> CrossSpectra:
         """Return the spectra of segments accepted since the last call, and keep all criteria.
 
-        Segments held back are returned by a later call.
+        Segments held back are returned by a later call. `ends` are those of the next ones.
         """
         accepted = self._accepted
-        self._accepted = CrossSpectra(self.settings, accepted.n_channels)
+        self._accepted = CrossSpectra(self.settings, accepted.n_channels, ends=ends)
         return accepted
 
     def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:

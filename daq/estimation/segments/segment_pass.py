@@ -31,7 +31,7 @@ from estimator.records import dataclass
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.equaliser import Equaliser
 from estimator.spectra.multiresolution import MultiResolution
-from estimator.spectra.parts import MOST, PartEnds, Parts, by_part, part_bins
+from estimator.spectra.parts import MOST, PartEnds, Parts, PieceEnds, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
 from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
 from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
@@ -306,17 +306,24 @@ class Pass:
         """Segments that are read together."""
         return max(1, _VALUES_AT_ONCE // (self.welch.hop * self.n_channels))
 
-    def drain(self, *, last: bool) -> CrossSpectra:
+    def drain(self, *, last: bool, ends: PieceEnds | None = None) -> CrossSpectra:
         """Return the spectra since the last call; none with octaves.
 
-        Segments held back for judgement are among the next ones, unless these are the last.
+        Segments held back for judgement are among the next ones, unless these are the last. `ends`
+        receives the sums of the next ones at the ends of parts.
         """
-        self._ends = None  # the sums begin again: no parts of time are kept of them
+        self._ends = None  # the sums begin again: no parts of the recording are kept of them
         if self._undisturbed is None:
-            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels)
+            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, ends=ends)
             return spectra
         self._selected = None
-        return self._undisturbed.spectra() if last else self._undisturbed.drain()
+        return self._undisturbed.spectra() if last else self._undisturbed.drain(ends)
+
+    def end_part(self, place: int) -> None:
+        """End a part before the segment with this number, where one is due."""
+        sums = self._all if self._undisturbed is None else self._undisturbed
+        if isinstance(sums.ends, PieceEnds) and sums.ends.is_due(place):
+            sums.end_part(place)
 
     @property
     def n_segments(self) -> int:

@@ -129,8 +129,7 @@ class SharedNoiseNotSearched(Fact):
 class SteadinessNotTested(Fact):
     """Whether noise and responses change during the recording is not tested; `causes` are why.
 
-    In an archive, which keeps neither parts of stretches nor samples, linearity and the rounding
-    that channels share are not tested either.
+    In an archive, which keeps no samples, it is linearity and the rounding that channels share.
 
     Attributes
     ----------
@@ -145,7 +144,7 @@ class SteadinessNotTested(Fact):
     def _words(self) -> Words:
         what = "Whether noise or responses change is not tested"
         if ARCHIVES in self.causes:
-            what = "Linearity, shared rounding, and changes within stretches are not tested"
+            what = "Linearity and shared rounding are not tested"
         text = f"{what} with {listed(self.causes)}"
         if self.is_open:
             return Words(

@@ -396,14 +396,16 @@ def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
         assert pooled.diagnostics.faulty == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("apart", [1, 24])
-def test_a_response_that_changes_between_hours_or_days_is_in_the_intervals(
+@pytest.mark.parametrize("apart", [0, 1, 24])
+def test_a_response_that_changes_within_or_between_hours_or_days_is_in_the_intervals(
     tmp_path: Path, apart: int
 ) -> None:
     def louder(name: str, counts: NDArray[np.int32]) -> NDArray[np.int32]:
-        return np.asarray(np.rint(counts * (1.2 if name == "A" else 1.0)), np.int32)
+        gain = np.full((len(counts), 1), 1.2 if name == "A" else 1.0)
+        gain[: len(gain) // 2 if apart == 0 else 0] = 1.0
+        return np.asarray(np.rint(counts * gain), np.int32)
 
-    paths = [record(tmp_path / "a.h5", hours=0.5)]
+    paths = [record(tmp_path / "a.h5", hours=0.5)] if apart else []
     later = START_NS + apart * HOUR_NS
     paths.append(record(tmp_path / "b.h5", hours=0.5, begin_ns=later, seed=2, device=louder))
     store = store_for(tmp_path / "store", paths[0])
@@ -417,6 +419,7 @@ def test_a_response_that_changes_between_hours_or_days_is_in_the_intervals(
     (fact,) = [each for each in facts_of_archive(found) if isinstance(each, ResponsesVary)]
     assert fact.channels == ("A.X", "A.Y")
     assert fact.share > 0.6
+    assert found.untested == 0
 
 
 def test_what_is_known_of_sensitivities_is_in_the_intervals(

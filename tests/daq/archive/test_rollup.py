@@ -46,7 +46,7 @@ def drawn(
 def summary_of(csms: list[NDArray[np.complex128]], first_hour: int = 0) -> Summary:
     hour = 3600 * 10**9
     rows = [((first_hour + k) * hour, N_SEGMENTS, csm) for k, csm in enumerate(csms)]
-    ((month, found),) = summaries(rows, DESCRIBED, PLAN, PLAN.noise_settings(SETTINGS))
+    ((month, found),) = summaries(rows, DESCRIBED, PLAN, PLAN.noise_settings(SETTINGS), {})
     assert month == "1970-01"
     return found
 

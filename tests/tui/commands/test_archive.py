@@ -327,7 +327,8 @@ def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> N
     validate("archive-2", document)
     facts = {each["kind"]: each for each in document["facts"]}
     assert list(facts) == [
-        "recordings-left-out", "changes-undecided", "stretches-left-out", "nights-not-compared",
+        "recordings-left-out", "changes-undecided", "changes-not-tested", "stretches-left-out",
+        "nights-not-compared",
     ]  # fmt: skip
     fact = facts["recordings-left-out"]
     assert (fact["rank"], fact["sensors"]) == ("delays", ["B"])

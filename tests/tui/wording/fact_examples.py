@@ -8,6 +8,7 @@ from typing import Any
 
 from daq.archive.facts import (
     AbsencesNotUsed,
+    ChangesNotTested,
     ChangesUndecided,
     NightsNotCompared,
     RecordingsLeftOut,
@@ -285,6 +286,7 @@ EXAMPLES: tuple[Fact, ...] = (
     SpectraUnreadable(rank=Rank.DELAYS, files=("Damaged.",)),
     ResponsesVary(rank=Rank.DELAYS, channels=("A.X", "A.Y"), share=0.86),
     ChangesUndecided(rank=Rank.DELAYS, n_days=2, needed=8),
+    ChangesNotTested(rank=Rank.TO_KNOW, n_segments=120),
     AbsencesNotUsed(rank=Rank.TO_KNOW, channels=("A.X", "B.Y"), n_segments=(120, 40)),
     StretchesLeftOut(rank=Rank.TO_KNOW, n_stretches=6),
     NightsNotCompared(rank=Rank.TO_KNOW, needed=3),
