@@ -6,7 +6,7 @@ import math
 
 from estimator.checks.advice import Advice, Names, Rank
 from estimator.records import Hertz, Seconds, Share
-from estimator.wording import Words, few, listed, percent, several, time_of_day
+from estimator.wording import Words, few, listed, percent, ratio, several, time_of_day
 
 LARGE_FALL = -0.8
 """Change of a gain, of its mean over the segments, below which its size is not known."""
@@ -230,7 +230,7 @@ def _response_change(advice: ResponseChanges, names: Names) -> str:
     if advice.band is not None:
         what = f"The response of {sensor} varied by {percent(advice.size)} at {advice.where}"
     elif advice.is_turn:
-        what = f"Sensor {sensor} turned by {math.degrees(abs(advice.size)):.2g}°"
+        what = f"Sensor {sensor} turned by {ratio(math.degrees(abs(advice.size)))}°"
     else:
         whose = sensor if advice.channel is None else names.channels[advice.channel]
         direction = "rose" if advice.size > 0 else "fell"
