@@ -569,6 +569,9 @@ SCALES = {
 _EPOCHS = ((1e17, "ns"), (1e14, "µs"), (1e11, "ms"))
 """Numbers without a unit above these are ns, µs or ms since 1970: as seconds, the year 5138."""
 
+_SLOW_NS = NS_PER_S
+"""Nanoseconds between samples above which times without a unit are doubted."""
+
 
 def is_time(cell: str) -> bool:
     """Tell whether a cell is a date, a time of day or both."""
@@ -597,7 +600,7 @@ def nanoseconds(cells: Sequence[str], unit: str, *, decimal_comma: bool) -> NDAr
     except ValueError:
         order = _order(cells)
         return _within_range([_dated(cell, order) for cell in cells], cells)
-    scale = SCALES.get(unit.lower())
+    scale, guessed = SCALES.get(unit.lower()), ""
     if scale is None:
         guessed = next((each for least, each in _EPOCHS if abs(value) > least), "s")
         scale = SCALES[guessed]
@@ -608,7 +611,14 @@ def nanoseconds(cells: Sequence[str], unit: str, *, decimal_comma: bool) -> NDAr
                 cells[0],
                 guessed,
             )
-    return _within_range([_scaled(cell, scale, comma=decimal_comma) for cell in cells], cells)
+    times = _within_range([_scaled(cell, scale, comma=decimal_comma) for cell in cells], cells)
+    if guessed == "s" and np.diff(times[:2]).sum() > _SLOW_NS:
+        _LOGGER.warning(
+            "times such as %s and %s have no unit; read as s: state the unit in the header, as in"
+            " time (ms)",
+            *cells[:2],
+        )
+    return times
 
 
 def _within_range(times: list[int], cells: Sequence[str]) -> NDArray[np.int64]:

@@ -172,6 +172,9 @@ def test_the_unit_of_times_without_one_is_said(
     (tmp_path / "a.csv").write_bytes(b"time,A.X\n1e12,1\n1000000000010,2\n")
     assert opened(tmp_path / "a.csv")["A"].sampling_rate == 100.0
     assert "times such as 1e12 have no unit; read as ms since 1970" in caplog.text
+    (tmp_path / "b.csv").write_bytes(b"time,A.X\n0,1\n10,2\n20,1\n")
+    assert opened(tmp_path / "b.csv")["A"].sampling_rate == 0.1
+    assert "times such as 0 and 10 have no unit; read as s: state the unit" in caplog.text
 
 
 @pytest.mark.parametrize(
