@@ -17,9 +17,9 @@ FloatArray = NDArray[np.float64]
 _PARTS = 8  # of a hop, examined one by one
 _MIN_SAMPLES = 32  # samples of a part
 _STILL = 1e-12  # of its value: a channel that changes less is at rest but for rounding
-_CURVES = ((2, 0.03), (4, 1e-4))
+_CURVES = ((2, 0.03), (4, 1e-5))
 """Points of a line, and of a cubic, and the share of their range: what leaves the curve through
-them less may be on it. Slow motion is a cubic to 1e-3."""
+them less may be on it. Slow motion is often a cubic to 1e-4."""
 _SLOPE = 16  # counts of that range, from which whole numbers follow a curve
 _HALF = 0.5 + 1e-9  # counts: rounding of the points, which the curve enlarges, and of those between
 _SMOOTH = 3  # sizes below the usual second difference, from which a curve is no motion

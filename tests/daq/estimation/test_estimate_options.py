@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.signal import butter, sosfilt
 
 from daq.bench.channel import Channel
 from daq.errors import CannotAlignError
@@ -194,12 +195,17 @@ def test_gaps_that_a_spline_fills_are_seen(counts: int) -> None:
     assert detector.for_a_while()[0] == pytest.approx(5, abs=1)
 
 
-def test_slow_motion_in_coarse_counts_is_not_interpolated() -> None:
-    time = np.arange(60_000) / RATE
-    swell = np.rint(1000 * np.sin(2 * np.pi * 0.1 * time))[:, None]
-    detector = FlatlineDetector(500, 1, RATE)
-    detector.add(swell, np.ones(len(swell), np.bool_))
-    assert detector.for_a_while()[0] == 0
+def test_slow_motion_in_coarse_counts_or_gusts_is_not_interpolated() -> None:
+    rng, time = np.random.default_rng(0), np.arange(60_000) / RATE
+    samples = np.rint(1000 * np.sin(2 * np.pi * 0.1 * time))[:, None].repeat(9, axis=1)
+    slow, gusts = (
+        sosfilt(butter(order, low, output="sos"), rng.standard_normal((60_000, 8)), axis=0)
+        for order, low in ((4, 0.005), (2, 2e-4))
+    )
+    samples[:, 1:] = slow * np.exp(1.5 * gusts / gusts.std(axis=0))
+    detector = FlatlineDetector(200, 9, RATE)
+    detector.add(samples, np.ones(len(samples), np.bool_))
+    assert detector.for_a_while().tolist() == [0] * 9
 
 
 def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -> None:
