@@ -122,8 +122,8 @@ async def test_registers_with_gaps_are_read_separately() -> None:
 
 async def test_an_absent_device_is_named_in_the_error(running: tuple[RunningDevice, ...]) -> None:
     absent = [
-        s.model_copy(update={"settings": {"preset": "witmotion", "device_id": 7, "timeout": 0.05}})
-        for s in on_bus(running[0])
+        s.model_copy(update={"settings": {"preset": "witmotion", "device_id": n, "timeout": 0.05}})
+        for n, s in enumerate(on_bus(running[0]), start=7)
     ]
     said = r"'A': expected registers 48 to 54 \(0x0030 to 0x0036\) of device 7; .*'A'"
     with pytest.raises(NoAnswerError, match=said):

@@ -305,7 +305,16 @@ class RegisterDriver(Driver[RegisterSettings]):
         """Return what is polled for each sensor."""
         settings = self.typed(sensors)
         require_address(sensors[0])
-        return [_Polled.of(sensor, settings[sensor.name]) for sensor in sensors]
+        polled = [_Polled.of(sensor, settings[sensor.name]) for sensor in sensors]
+        known: dict[tuple[int, int, int], str] = {}
+        for each in polled:
+            for address in each.registers.addresses:
+                place = each.device_id, each.registers.function, address
+                if known.setdefault(place, each.sensor.name) != each.sensor.name:
+                    expected = f"register {address} of device {each.device_id} is that of sensor"
+                    expected += f" {known[place]!r}: expected another device_id or address"
+                    raise each.sensor.fault("settings.device_id", expected, each.device_id)
+        return polled
 
     @contextlib.asynccontextmanager
     async def open(

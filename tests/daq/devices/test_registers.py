@@ -17,7 +17,7 @@ from daq.bench.model import Sensor
 from daq.devices.modbus import rtu
 from daq.devices.modbus.bus import open_bus
 from daq.devices.registry import driver_type
-from daq.errors import NoAnswerError
+from daq.errors import BenchFileError, NoAnswerError
 from daq.protocols.block import Block, Event
 from tests.devices import host_clock
 from tests.sensors import sensor_at
@@ -236,3 +236,13 @@ async def test_numbers_of_requests_may_wrap_over_tcp(monkeypatch: pytest.MonkeyP
                 answer = await bus.read(3, 1, 0, 2)
                 assert answer.registers == [n, n + 1]
     assert numbers == [*range(64_981, 65_001), *range(1, 31)]
+
+
+def test_sensors_that_read_one_register_are_refused_with_the_bench() -> None:
+    first = sensor("/dev/ttyUSB0", address=0)
+    second = first.model_copy(update={"name": "Q"})
+    check = driver_type("registers").check
+    with pytest.raises(BenchFileError, match=r"Q.*device 1 is that of sensor .*device_id"):
+        check([first, second])
+    check([first, second.model_copy(update={"settings": {"address": 0, "device_id": 2}})])
+    check([first, second.model_copy(update={"settings": {"address": 100}})])
