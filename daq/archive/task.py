@@ -325,7 +325,7 @@ class StretchPass(Pass):
 
     @property
     def _at_once(self) -> int:
-        return max(1, min(super()._at_once, self._places // MOST))
+        return max(1, min(super()._at_once, self._places // PARTS))
 
     @cached_property
     def _estimator(self) -> tuple[Estimator, Grid]:
