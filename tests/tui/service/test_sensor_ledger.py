@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -37,13 +36,6 @@ driver = "text"
 port = "/dev/tty{name}"
 channels = [{{name = "X", sensitivity = 1.0}}, {{name = "Y", sensitivity = 1.0}}]
 """
-EARLIER = (
-    "ALTER TABLE sensors DROP COLUMN firmware",
-    """PRAGMA writable_schema = ON;
-    UPDATE sqlite_master SET sql = replace(sql, 'caveats TEXT', 'simulated INTEGER')""",
-    "UPDATE tests SET simulated = simulated <> ''; UPDATE noise SET simulated = simulated <> ''",
-)
-"""What makes a ledger one of an earlier version, each on a connection of its own."""
 BENCH = "sampling_rate = 64.0\n" + "".join(SENSOR.format(name=name) for name in "ABC")
 
 
@@ -134,22 +126,13 @@ def test_history_shows_a_sensor_over_all_benches(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("caveats", [NO_CAVEATS, Caveats([Caveat.SIMULATED])])
-def test_a_ledger_of_an_earlier_version_takes_further_tests(
-    caveats: Caveats, tmp_path: Path, ledger: Path
-) -> None:
+def test_tests_with_the_same_caveats_are_compared(caveats: Caveats, tmp_path: Path) -> None:
     def test_of(day: int) -> list[str]:
         path = recorded(tmp_path, bench="lab", day=day)
         return noted(path, Result(replace(estimate([path], SETTINGS), caveats=caveats), SETTINGS))
 
     test_of(0)
-    for script in EARLIER:
-        with closing(sqlite3.connect(ledger)) as old:
-            old.executescript(script)
-    assert [each.firmware for each in sensor_tests("S1")] == [""]
-    assert [each.caveats for each in sensor_tests("S1")] == [caveats]
-    assert {each for *_, each in noise_of("S1")} == {caveats}
-    assert len(test_of(1)) == 3  # tests with the same caveats are compared
-    assert [each.firmware for each in sensor_tests("S1")] == ["", "1.1"]
+    assert len(test_of(1)) == 3
     assert [each.caveats for each in sensor_tests("S1")] == [caveats, caveats]
     assert {each for *_, each in noise_of("S1")} == {caveats}
 
