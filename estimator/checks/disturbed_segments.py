@@ -140,8 +140,8 @@ def segment_findings(
     degrees = np.array([own[group].sum() for group in groups])
     out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)
     found = replace(found, is_restless=not calm.all())
-    if not out.any() or variance.any():
-        return found
+    if not out.any() or variance.any():  # what is taken for motion leaves no residual
+        return found if found.is_restless else _louder_than_others(found, course, there, dims)
     inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
     lack = [1 / np.maximum(1 + excess[group].mean(axis=0), 0.01) - 1 for group in groups]
