@@ -56,12 +56,13 @@ class ResponsesVary(Fact):
     share: Share
 
     def _words(self) -> Words:
-        much = f"up to {percent(self.share)} of it is motion"
+        much, who = percent(self.share), few(list(self.channels))
         return Words(
-            f"Responses change: noise of {few(list(self.channels))}, {much}; take steady days",
+            f"Responses change: up to {much} of the noise of {who} is motion; use steady days",
             f"The noise of {listed(self.channels)} from all spectra together is more than that of"
-            f" steady parts of time: {much}, as responses change within or between stretches.",
-            "Take days or recordings in which responses are steady, and let sensors settle.",
+            f" steady parts of time: up to {much} of it is motion, as responses change within or"
+            " between stretches.",
+            "Use days or recordings in which responses are steady, and let sensors settle.",
         )
 
 

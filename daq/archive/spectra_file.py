@@ -104,8 +104,8 @@ class Described:
         As in `daq.estimation.snapshot.SnapshotDiagnostics`.
     lacking : mapping of int to int
         Segments that other channels have and a channel lacks, by its column: they are not kept.
-    shortened : mapping of str to (float, float)
-        As in `daq.estimation.snapshot.Snapshot`, and `sensitivities`.
+    shortened, sensitivities : mapping
+        As in `daq.estimation.snapshot.Snapshot`.
     rounded : bool
         Whether estimates are made of matrices that were kept in single precision.
     caveats : Caveats

@@ -440,7 +440,7 @@ class _Recorder:
             free = shutil.disk_usage(self._path.absolute().parent).free
             is_enough = free / wanted >= (SPACE_FOR if duration is None else duration)
             level = logging.INFO if is_enough else logging.WARNING
-            step = 86400 if free / wanted > 7 * 86400 else 60
+            step = next((each for each in (86400, 60) if free / wanted > 7 * each), 1)
             lasts = format_duration(free / wanted // step * step)
             _LOGGER.log(level, "%.0f MB of free space last for %s or longer", free / 1e6, lasts)
 

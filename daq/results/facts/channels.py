@@ -14,7 +14,7 @@ from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
 from estimator.checks.sensitivities import CAUSES, TOLERANCE, likely_cause, wrong_gains
 from estimator.levels.bands import third_octaves
-from estimator.records import Hertz, Seconds
+from estimator.records import Hertz, Seconds, Share
 from estimator.wording import Words, few, listed, percent, several
 
 MUCH_ROUNDING = 0.1
@@ -190,7 +190,7 @@ class SensitivitiesDiffer(Fact):
         Largest difference, relative.
     """
 
-    share: float
+    share: Share
 
     def _words(self) -> Words:
         text = f"differ between the recordings by {percent(self.share)}"

@@ -142,9 +142,10 @@ class SteadinessNotTested(Fact):
     is_open: bool
 
     def _words(self) -> Words:
-        what = "Whether noise or responses change is not tested"
+        what, bench = "Whether noise or responses change is not tested", "a steady bench"
         if ARCHIVES in self.causes:
             what = "Linearity and shared rounding are not tested"
+            bench = "linear sensors and fine counts"
         text = f"{what} with {listed(self.causes)}"
         if self.is_open:
             return Words(
@@ -152,7 +153,7 @@ class SteadinessNotTested(Fact):
                 f"{text}: the intervals have no lower end.",
                 "Record longer.",
             )
-        return Words(text, f"{text}: the intervals hold for a steady bench.")
+        return Words(text, f"{text}: the intervals hold for {bench}.")
 
 
 class LikeChannelsAssumed(Fact):
