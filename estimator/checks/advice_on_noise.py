@@ -227,12 +227,13 @@ class ResponseChanges(Advice):
 def _response_change(advice: ResponseChanges, names: Names) -> str:
     """Return what changed, by how much and when."""
     (sensor,) = (names.sensors[number] for number in advice.sensors)
-    if advice.band is not None:
-        what = f"The response of {sensor} varied by {percent(advice.size)} at {advice.where}"
-    elif advice.is_turn:
-        what = f"Sensor {sensor} turned by {ratio(math.degrees(abs(advice.size)))}°"
+    whose = sensor if advice.channel is None else names.channels[advice.channel]
+    if advice.is_turn:
+        and_fro = " to and fro" if advice.band is not None else ""
+        what = f"Sensor {sensor} turned{and_fro} by {ratio(math.degrees(abs(advice.size)))}°"
+    elif advice.band is not None:
+        what = f"The response of {whose} varied by {percent(advice.size)} at {advice.where}"
     else:
-        whose = sensor if advice.channel is None else names.channels[advice.channel]
         direction = "rose" if advice.size > 0 else "fell"
         by = "more than half" if _is_large_fall(advice) else percent(abs(advice.size))
         what = f"The gain of {whose} {direction} by {by}"

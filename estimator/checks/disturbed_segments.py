@@ -1,22 +1,18 @@
 """Single segments: disturbed ones, gains that change from one to the next, loudness of noise.
 
-A segment is disturbed if its residual beside the motion stands out. A sensor whose gain is by g off
-in a segment leaves g times the motion in its residual, at all frequencies; noise leaves at two
-frequencies what is independent. So products of what the motion explains of residuals, at different
-frequencies, have the mean g², whatever the noise does. Less those of one segment with a later one,
-they show what gains do that no part of time shows.
+A segment is disturbed if its residual beside the motion stands out.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.checks.loudness import LASTS, Loudness, across, without_bursts
+from estimator.checks.loudness import LASTS, Loudness, without_bursts
+from estimator.checks.segment_gains import SegmentGains, UnsteadyGain
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
@@ -29,14 +25,6 @@ DISTURBED = 8.0
 """Residuals of a group from which a segment is disturbed, in standard deviations by the median."""
 RESTLESS = 3.0
 """Scatter of single segments over that of steady noise, from which none is disturbed."""
-LATER = 2
-"""Segments after which a gain that drifts is the same: those between overlap both."""
-TOGETHER = 4
-"""Segments whose products are averaged before their scatter is measured: neighbours overlap."""
-UNSTABLE = 4.5
-"""Standard errors from which gains change from segment to segment."""
-LARGEST = 0.5
-"""Variance of a gain over the largest of all, from which it is no part of that in the motion."""
 MAX_DISTURBED = 0.2
 """Maximum share of disturbed segments; with more, the noise changes and no segment is excluded."""
 
@@ -74,9 +62,8 @@ class SegmentFindings:
         Noise that these add, as a share.
     is_restless : bool
         Whether the noise of others changes from segment to segment, at some frequencies.
-    gains, sure : float64, shape (n_sensors,)
-        Variance of the gains of a sensor between segments, 0 unless significant; over its standard
-        error.
+    gains : tuple of UnsteadyGain
+        Gains and turns that change within parts of time.
     loudness : Loudness
         Of the noise.
     """
@@ -84,23 +71,26 @@ class SegmentFindings:
     disturbed: BoolArray
     excess: FloatArray
     is_restless: bool
-    gains: FloatArray
-    sure: FloatArray
+    gains: tuple[UnsteadyGain, ...]
     loudness: Loudness
 
     @classmethod
     def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
         """Return findings of segments that show nothing."""
         disturbed, excess = np.zeros(n_segments, np.bool_), np.zeros((1, sum(dims)))
-        nothing = np.zeros(len(dims))
-        return cls(disturbed, excess, False, nothing, nothing, Loudness.steady(sum(dims)))
+        return cls(disturbed, excess, False, (), Loudness.steady(sum(dims)))
 
 
 def segment_findings(
-    course: SegmentCourse, maximum: Maximum, good: BoolArray, dims: tuple[int, ...]
+    course: SegmentCourse,
+    maximum: Maximum,
+    good: BoolArray,
+    dims: tuple[int, ...],
+    begin: FloatArray,
 ) -> SegmentFindings:
     """Return what segments show at `good` frequencies, shape (n_freqs,).
 
+    `begin` are the times at which parts begin, within which gains may change, shape (n_parts,).
     Where noise changes all the time, at some frequencies, or gains do, segments are not disturbed.
     """
     none = SegmentFindings.none(len(course.spectra), dims)
@@ -121,13 +111,13 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    gains, powers, felt = _Gains(own, groups, dims), [], []
+    gains, powers, felt = SegmentGains(own, course.bins[there], groups, dims), [], []
     for residual, motion in residuals:
         powers.append((np.abs(residual) ** 2).sum(axis=1))
         felt.append((np.abs(motion) ** 2).sum(axis=(1, 2)))
         gains.add(residual, motion)
-    variance, sure = gains.variance()
-    found = replace(none, gains=variance, sure=sure)
+    part = np.searchsorted(begin, course.times, side="right")
+    found = replace(none, gains=gains.unsteady(part))
     groups = groups[:n_good]
     if not groups:
         return _louder_than_others(found, course, there, dims)
@@ -140,7 +130,7 @@ def segment_findings(
     degrees = np.array([own[group].sum() for group in groups])
     out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)
     found = replace(found, is_restless=not calm.all())
-    if not out.any() or variance.any():  # what is taken for motion leaves no residual
+    if not out.any() or found.gains:  # what is taken for motion leaves no residual
         return found if found.is_restless else _louder_than_others(found, course, there, dims)
     inverse = fisher.covariance(np.abs(residuals.projector) ** 2)
     excess = np.einsum("fpq,fq->fp", inverse, residuals.powers(~out) - own)
@@ -174,47 +164,6 @@ def _louder_than_others(
         return found
     excess = np.where(np.repeat(louder.any(axis=(0, 1)), d), np.nan, 0.0)[None]
     return replace(found, disturbed=found.disturbed | out, excess=excess)
-
-
-class _Gains:
-    """Gains of every sensor in every segment, by groups of frequencies.
-
-    Parameters
-    ----------
-    own : float64, shape (n_bins, n_channels)
-        Share of a channel beside the motion.
-    groups : list of int64
-    dims : tuple of int
-    """
-
-    def __init__(self, own: FloatArray, groups: list[IntArray], dims: tuple[int, ...]) -> None:
-        self._own, self._first = [own[group] for group in groups], np.cumsum([0, *dims])[:-1]
-        self._score: list[FloatArray] = []
-        self._weight: list[FloatArray] = []
-
-    def add(self, residual: ComplexArray, motion: ComplexArray) -> None:
-        """Add the next group, of shape (n_segments, n_freqs, n_channels)."""
-        along = (residual * motion.conj()).real.sum(axis=1)
-        known = ((np.abs(motion) ** 2) * self._own[len(self._score)]).sum(axis=1)
-        self._score.append(np.add.reduceat(along, self._first, axis=1))
-        self._weight.append(np.add.reduceat(known, self._first, axis=1))
-
-    def variance(self) -> tuple[FloatArray, FloatArray]:
-        """Return `gains` and `sure` of `SegmentFindings`."""
-        n_sensors, n = len(self._first), len(self._score[0]) - LATER
-        n_blocks = n // TOGETHER
-        found = np.zeros((max(n, 0), n_sensors))
-        if len(self._score) == 1 or n_blocks < TOGETHER:
-            return np.zeros(n_sensors), np.zeros(n_sensors)
-        score, weight = np.stack(self._score), np.stack(self._weight)
-        for sign, later in ((1, 0), (-1, LATER)):
-            along, known = (across(e[:, :n], e[:, later : later + n]) for e in (score, weight))
-            found += sign * along / known.sum(axis=0)
-        blocks = found[: n_blocks * TOGETHER].reshape(n_blocks, TOGETHER, -1).sum(axis=1)
-        total, sure = found.sum(axis=0), blocks.mean(axis=0) / blocks.std(axis=0, ddof=1)
-        sure *= math.sqrt(n_blocks)
-        is_seen = (sure > UNSTABLE) & (total > LARGEST * total.max())
-        return np.where(is_seen, total, 0.0), sure
 
 
 class _Residuals:

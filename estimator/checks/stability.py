@@ -397,7 +397,7 @@ def stability(
             time=(begin, end),
         )
     single = (
-        segment_findings(course, maximum, good, dims)
+        segment_findings(course, maximum, good, dims, begin)
         if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS
         else SegmentFindings.none(0, dims)
     )
@@ -479,33 +479,46 @@ def _and_unstable(
     dims: tuple[int, ...],
     time: tuple[FloatArray, FloatArray],
 ) -> tuple[tuple[ResponseChange, ...], FloatArray, FloatArray]:
-    """Return changes with those of gains that change from segment to segment, in their place.
+    """Return changes with those of gains that change within parts of time, in their place.
 
     With what changes add to the motion's PSD, as from `_changed`, and what such gains add to the
     noise, as a share, shape (n_bands, n_channels).
     """
     changes, added = known
-    left = np.full((len(insides), sum(dims)), np.nan)
-    if not single.gains.any():
-        return changes, added, np.zeros_like(left)
-    variance = np.repeat(single.gains, dims)
-    for number, inside in enumerate(insides):
+    left, nothing = np.full((len(insides), sum(dims)), np.nan), np.zeros(sum(dims))
+    for number, inside in enumerate(insides if single.gains else ()):
         if inside.any():
             at = maximum.take(np.flatnonzero(inside))
             motion = (np.abs(at.eigenvectors) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
-            noise = np.where(variance, np.einsum("fpp->fp", at.rest).real, 1.0)
-            left[number] = variance * median(motion / noise)
+            noise = np.einsum("fpp->fp", at.rest).real
+            more = np.stack([sum((g.added(m) for g in single.gains), nothing) for m in motion])
+            left[number] = median(more / np.where(more > 0, noise, 1.0))
+    if np.isnan(left).all():
+        return changes, added, np.zeros_like(left)
     left = np.where(np.isnan(left), np.nanmax(left, axis=0), left)
-    most = np.maximum.reduceat(left.max(axis=0), np.cumsum([0, *dims[:-1]]))
     begin, end = float(time[0][0]), float(time[1][-1])
     band = float(edges[0][0]), float(edges[1][-1])
-    for sensor in np.flatnonzero(most > LEAST_LEFT).tolist():
-        size, sure = math.sqrt(single.gains[sensor]), float(single.sure[sensor])
-        error = size / (2 * sure)
-        own = ResponseChange(sensor, None, False, size, error, begin, end, sure**2, 1.0, band)
-        changes = (own, *(each for each in changes if each.sensor != sensor))
-    left *= np.repeat(most > LEAST_LEFT, dims)
-    return changes, np.where(left.any(axis=0), np.maximum(added, variance), added), left
+    for each in single.gains:
+        own = [a for a, _, _ in each.pairs]
+        if left[:, own].max() <= LEAST_LEFT:
+            left[:, own] = 0.0
+            continue
+        size = math.sqrt(each.variance)
+        change = ResponseChange(
+            sensor=each.sensor,
+            channel=each.pairs[0][0] if each.channel is not None else None,
+            is_turn=each.is_turn,
+            size=size,
+            error=size / (2 * each.sure),
+            begin=begin,
+            end=end,
+            statistic=each.sure**2,
+            degrees=1.0,
+            band=band,
+        )
+        changes = (change, *(e for e in changes if e.sensor != each.sensor))
+        added = np.maximum(added, each.added(nothing + 1))
+    return changes, added, left
 
 
 def _also_by_band(

@@ -494,7 +494,7 @@ class ResponseChange:
     band: tuple[float, float] | None = None
 
 
-def _patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
+def patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
     """Return gains of all channels, of each, and turns: unit matrices, flattened."""
     found: list[tuple[int | None, bool, FloatArray]] = [(None, False, np.eye(d).reshape(1, -1))]
     if d > 1:
@@ -540,8 +540,8 @@ def response_change(
     score, information = scores.sensor(sensor)
     statistic, degrees = _chi_squared(score, information)
     d = scores.dims[sensor]
-    patterns, courses = _patterns(d), _courses(begin, end)
-    best, pattern, course = -math.inf, patterns[0], courses[0]
+    forms, courses = patterns(d), _courses(begin, end)
+    best, pattern, course = -math.inf, forms[0], courses[0]
     size, error = 0.0, math.inf
     total = np.linalg.pinv(information.sum(axis=0), rcond=1e-9, hermitian=True)
     for each in courses:
@@ -550,7 +550,7 @@ def response_change(
         own = np.tensordot(c, information, axes=1)
         known = np.tensordot(c**2, information, axes=1) - own @ total @ own
         along = c @ score
-        for one in patterns:
+        for one in forms:
             rows = one[2]
             variance = np.linalg.pinv(rows @ known @ rows.T, hermitian=True)
             found = variance @ (rows @ along)

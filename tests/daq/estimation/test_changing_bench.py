@@ -46,6 +46,8 @@ def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, 
             felt[later] = felt[later] @ Rotation.from_rotvec([0, 0, np.radians(0.05)]).as_matrix()
         elif name == "B" and kind == "jitter":  # in steps of 4 s
             felt *= 1 + 0.02 * rng.standard_normal((n // 80, 1)).repeat(80, axis=0)
+        elif name == "B" and kind == "halves":  # a part of time is 20 segments, of 2.5 s each
+            felt[np.arange(n) // round(25 * RATE) % 2 == 1, 0] *= 1.05
         elif kind == "temperature":
             felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
         samples[name] = felt + rng.standard_normal((n, 3))
@@ -196,13 +198,23 @@ def test_of_few_averages_a_change_is_named_and_opens_the_interval(*, octaves: bo
         assert mean.low[0] <= NOISE <= mean.high[0]
 
 
-@pytest.mark.parametrize("ratio", [1e4, 1e6])
-def test_a_gain_that_changes_from_segment_to_segment_bounds_its_noise(ratio: float) -> None:
+@pytest.mark.parametrize(
+    ("kind", "channel", "least", "ratio"),
+    [
+        ("jitter", None, 0.01, 1e4),  # of segments of 5 s, weighted by the window
+        ("jitter", None, 0.01, 1e6),
+        ("halves", 3, 0.02, 1e4),
+    ],
+)
+def test_a_gain_that_changes_within_parts_bounds_its_noise(
+    kind: str, channel: int | None, least: float, ratio: float
+) -> None:
     """Parts of time do not show it: noise of B was 7 and 26 dB too high in silence."""
-    snapshot = estimated("jitter", 1, ratio=ratio)
+    snapshot = estimated(kind, 1, ratio=ratio)
     (change,) = changes(snapshot)
     assert change.sensors == (1,)
-    assert 0.01 < change.size < 0.02  # of segments of 5 s, weighted by the window
+    assert change.channel == channel
+    assert least < change.size < least + 0.01
     assert held(snapshot) > 0.93
 
 

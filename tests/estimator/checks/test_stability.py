@@ -137,9 +137,9 @@ def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> Non
     course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
     for n_doubtful, found in ((0, [7]), (4, [7]), (20, [7]), (44, [])):
         good = np.arange(48) >= n_doubtful
-        shown = segment_findings(course, maximise(csm, 1), good, (1, 1, 1))
+        shown = segment_findings(course, maximise(csm, 1), good, (1, 1, 1), np.zeros(1))
         assert np.flatnonzero(shown.disturbed).tolist() == found
-        assert not shown.gains.any()
+        assert not shown.gains
 
 
 def test_loudness_that_changes_from_segment_to_segment_is_no_independent_scatter() -> None:
@@ -156,7 +156,7 @@ def test_loudness_that_changes_from_segment_to_segment_is_no_independent_scatter
         csm = np.einsum("sfp,sfq->fpq", spectra, spectra.conj()) / len(spectra)
         course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
         good = np.ones(48, np.bool_)
-        found = segment_findings(course, maximise(csm, 1), good, (1, 1, 1)).loudness
+        found = segment_findings(course, maximise(csm, 1), good, (1, 1, 1), np.zeros(1)).loudness
         seen.append(200 * found.deviation**2)
     restless, steady = np.array(seen[::2]), np.array(seen[1::2])
     # the variance of 200 draws of a gamma variable of kurtosis 5.4: 16 %, of 20 means 4 %

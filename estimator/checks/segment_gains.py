@@ -1,0 +1,160 @@
+"""Gains and turns that change within parts of time, whatever their period.
+
+A sensor whose gain is by g off in a segment leaves g times the motion in its residual, at all
+frequencies; noise leaves at two frequencies what is independent. So products of what the motion
+explains of residuals, at different frequencies, have the mean g², whatever the noise does. What the
+mean of a part of time explains is taken off first: parts show it (`estimator.checks.steadiness`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from estimator.checks.loudness import across
+from estimator.checks.steadiness import patterns
+from estimator.records import dataclass
+from estimator.types import ComplexArray, FloatArray, IntArray
+
+TOGETHER = 4
+"""Segments whose products are averaged before their scatter is measured: neighbours overlap."""
+UNSTABLE = 4.5
+"""Standard errors from which gains change within parts."""
+LARGEST = 0.5
+"""Power of a change over the largest of all, from which it is no part of that in the motion."""
+SLOW = 0.25
+"""Variance of a gain within parts over that between them, below which it is a course of parts."""
+FEW = 2
+"""Parts that alone do not show that gains change: about a step."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnsteadyGain:
+    """A gain or a turn of a sensor that changes within parts of time.
+
+    Attributes
+    ----------
+    sensor : int
+    channel : int or None
+        Of the sensor, whose gain alone changes; None: all of them.
+    pairs : tuple of (int, int, float)
+        Channels among all that move, the channels whose motion they get, and the sign.
+    is_turn : bool
+    variance : float
+        Of the gain, or of the angle in radians.
+    sure : float
+        Over its standard error.
+    """
+
+    sensor: int
+    channel: int | None
+    pairs: tuple[tuple[int, int, float], ...]
+    is_turn: bool
+    variance: float
+    sure: float
+
+    def added(self, motion: FloatArray) -> FloatArray:
+        """Return what it adds to the channels, given the power of their motion, (n_channels,)."""
+        found = np.zeros_like(motion)
+        for a, b, _ in self.pairs:
+            found[a] = self.variance * motion[b]
+        return found
+
+
+class SegmentGains:
+    """Gains and turns of every sensor in every segment, by groups of frequencies.
+
+    Parameters
+    ----------
+    own : float64, shape (n_bins, n_channels)
+        Share of a channel beside the motion.
+    bins : int64, shape (n_bins,)
+    groups : list of int64
+        Indices of each group among them.
+    dims : tuple of int
+    """
+
+    def __init__(
+        self, own: FloatArray, bins: IntArray, groups: list[IntArray], dims: tuple[int, ...]
+    ) -> None:
+        self._own, self._some = [own[group] for group in groups], list(_apart(bins, groups))
+        self._patterns = list(_of_sensors(dims))
+        self._score: list[FloatArray] = []
+        self._weight: list[FloatArray] = []
+
+    def add(self, residual: ComplexArray, motion: ComplexArray) -> None:
+        """Add the next group, of shape (n_segments, n_freqs, n_channels)."""
+        some, own = self._some[len(self._score)], self._own[len(self._score)]
+        residual, motion, own = residual[:, some], motion[:, some], own[some]
+        power = motion.real**2 + motion.imag**2
+        score, weight = np.zeros((2, len(self._patterns), len(residual)))
+        for number, pattern in enumerate(self._patterns):
+            for a, b, sign in pattern.pairs:
+                one, other = residual[..., a], motion[..., b]
+                along = one.real * other.real + one.imag * other.imag
+                score[number] += sign * along.sum(axis=1)
+                weight[number] += power[..., b] @ own[:, a]
+        self._score.append(score.T)
+        self._weight.append(weight.T)
+
+    def unsteady(self, part: IntArray) -> tuple[UnsteadyGain, ...]:
+        """Return what changes within parts of time, of which `part` tells each segment's, rising.
+
+        Of each sensor the change that adds most.
+        """
+        first = np.flatnonzero(np.diff(part, prepend=-1))
+        n_blocks = len(part) // TOGETHER
+        if len(self._score) == 1 or n_blocks < TOGETHER:
+            return ()
+        score, weight = np.stack(self._score), np.stack(self._weight)
+        total = np.add.reduceat(weight, first, axis=1)
+        mean = np.add.reduceat(score, first, axis=1) / np.where(total > 0, total, 1.0)
+        place = np.repeat(np.arange(len(first)), np.diff(first, append=len(part)))
+        score -= mean[:, place] * weight
+        mean -= (mean * total).sum(axis=1, keepdims=True) / total.sum(axis=1, keepdims=True)
+        between = across(mean * total, mean * total).sum(axis=0) / across(total, total).sum(axis=0)
+        found = across(score, score) / across(weight, weight).sum(axis=0)
+        blocks = found[: n_blocks * TOGETHER].reshape(n_blocks, TOGETHER, -1).sum(axis=1)
+        sure = math.sqrt(n_blocks) * blocks.mean(axis=0) / blocks.std(axis=0, ddof=1)
+        variance, by_part = found.sum(axis=0), np.sort(np.add.reduceat(found, first), axis=0)
+        is_seen = (sure > UNSTABLE) & (variance > SLOW * between)
+        is_seen &= by_part[:-FEW].sum(axis=0) > SLOW * variance
+        power = variance * [len(each.pairs) for each in self._patterns]
+        is_seen &= power > LARGEST * power.max()
+        best: dict[int, UnsteadyGain] = {}
+        for number in np.flatnonzero(is_seen)[np.argsort(power[is_seen])].tolist():
+            own = self._patterns[number]
+            best[own.sensor] = UnsteadyGain(
+                own.sensor,
+                own.channel,
+                own.pairs,
+                own.is_turn,
+                float(variance[number]),
+                float(sure[number]),
+            )
+        return tuple(best.values())
+
+
+def _apart(bins: IntArray, groups: list[IntArray]) -> Iterator[IntArray]:
+    """Yield the places in each group of frequencies that are no neighbours of earlier groups."""
+    before = bins[:0]
+    for group in groups:
+        near = np.isin(bins[group] - 1, before) | np.isin(bins[group] + 1, before)
+        before = np.concatenate([before, bins[group]])
+        yield np.flatnonzero(~near)
+
+
+def _of_sensors(dims: tuple[int, ...]) -> Iterator[UnsteadyGain]:
+    """Yield gains of all channels of each sensor, of each channel, and turns about each axis."""
+    for sensor, (end, d) in enumerate(zip(itertools.accumulate(dims), dims, strict=True)):
+        for channel, is_turn, rows in patterns(d):
+            for row in rows.reshape(-1, d, d):
+                to, of = np.nonzero(row)
+                signs = row[to, of].tolist()
+                pairs = tuple(
+                    zip((to + end - d).tolist(), (of + end - d).tolist(), signs, strict=True)
+                )
+                yield UnsteadyGain(sensor, channel, pairs, is_turn, 0.0, 0.0)
