@@ -79,7 +79,7 @@ from estimator.likelihood.factor_analysis import Maxima
 from estimator.self_noise.result import SelfNoise
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.segment_rejection import Reason
-from estimator.spectra.welch import SegmentSpectra
+from estimator.spectra.welch import SegmentSpectra, kept_rows
 
 
 def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:
@@ -108,7 +108,7 @@ def segment_course(
     for run, each in enumerate(passes):
         if each.single is None or each.n_bridged:
             return None
-        some = slice(None, None, every // each.single.every)
+        some = kept_rows(len(each.single), every // each.single.every)
         found, at = each.single.values()[some], each.kept_at[some]
         later = (each.aligned.start_utc_ns - origin) * 1e-9
         spectra.append(found)

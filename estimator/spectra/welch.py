@@ -583,8 +583,21 @@ def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
 
 KEPT_FREQUENCIES = 48
 MAX_SEGMENTS, MAX_VALUES = 4096, 1 << 21
-"""Maximum numbers of kept segments and values; beyond, every second segment is kept, then every
-fourth, and so on."""
+"""Maximum numbers of kept segments and values; beyond, one of two segments is kept, then one of
+four, and so on."""
+_SCRAMBLES = 2654435769  # the golden ratio of 2**32
+
+
+def kept_rows(n: int, every: int) -> IntArray:
+    """Return which of n rows are kept where one of `every` is, a power of two.
+
+    They are unevenly spaced: what changes with a period is met at all its phases. Of those kept of
+    two, one of two is kept of four.
+    """
+    rows = np.arange(-(-n // every))
+    for _ in range(every.bit_length() - 1):
+        rows = 2 * rows + (rows * _SCRAMBLES >> 16 & 1)
+    return rows[rows < n]
 
 
 def kept_bins(n_freqs: int) -> IntArray:
@@ -618,7 +631,7 @@ class SegmentSpectra:
     Attributes
     ----------
     every : int
-        Every `every`-th segment is kept.
+        One of so many segments is kept (`kept_rows`).
     most : int
         Maximum number of kept segments.
     """
@@ -639,13 +652,12 @@ class SegmentSpectra:
         ----------
         spectra : complex, shape (n_segments, n_kept, n_channels)
         """
-        number = self._n_seen + np.arange(len(spectra))
+        first = self._n_seen
         self._n_seen += len(spectra)
-        kept = number % self.every == 0
-        while self._n_kept + np.count_nonzero(kept) > self.most:
+        while len(kept := kept_rows(self._n_seen, self.every)) > self.most:
             self.thin(2 * self.every)
-            kept = number % self.every == 0
-        end = self._n_kept + int(np.count_nonzero(kept))
+        kept = kept[self._n_kept :] - first
+        end = self._n_kept + len(kept)
         if end > len(self._kept):
             # One array that grows: small ones would lie between others that are freed.
             n_rows = max(end, min(2 * len(self._kept), self.most))
@@ -660,9 +672,9 @@ class SegmentSpectra:
         return self._n_kept
 
     def thin(self, every: int) -> None:
-        """Keep every `every`-th segment from now on, a multiple of the current value."""
+        """Keep one of `every` segments from now on, a multiple of the current value."""
         if every != self.every:
-            self._kept = self.values()[:: every // self.every].copy()
+            self._kept = self.values()[kept_rows(self._n_kept, every // self.every)]
             self._n_kept = len(self._kept)
             self.every = every
 

@@ -33,7 +33,7 @@ from estimator.spectra.equaliser import Equaliser
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, PieceEnds, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
-from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
+from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins, kept_rows
 from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
 
 FloatArray = NDArray[np.float64]
@@ -360,7 +360,7 @@ class Pass:
     def kept_at(self) -> NDArray[np.int64]:
         """Grid samples at which the segments of `single` begin."""
         at = self._kept_at.values
-        return at if self.single is None else at[:: self.single.every]
+        return at if self.single is None else at[kept_rows(len(at), self.single.every)]
 
     @property
     def n_complete(self) -> int:
