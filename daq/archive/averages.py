@@ -22,7 +22,7 @@ from daq.estimation.noise_estimates import (
     noise_estimates,
     responses,
 )
-from daq.estimation.snapshot import ChannelLabel, Snapshot
+from daq.estimation.snapshot import ChannelLabel, Overlap, Snapshot
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
@@ -205,6 +205,7 @@ class Estimator:
             sensitivities=average.sensitivities,
             caveats=average.caveats,
             shortened=average.shortened,
+            overlaps=average.overlaps,
         )
         return with_contributions(snapshot)
 
@@ -234,6 +235,7 @@ class Average:
         self.counts = CountLimits()
         self.stood_still: dict[int, float] = {}
         self.shortened: dict[str, tuple[float, float]] = {}
+        self.overlaps: tuple[Overlap, ...] = ()
         self.sensitivities: Sensitivities = {}
 
     def add(
@@ -265,6 +267,7 @@ class Average:
         """Count what is known of a recording as a whole."""
         self.elapsed += described.elapsed
         self.closed &= described.origin.closed
+        self.overlaps += described.overlaps
         self.left_out.update(described.left_out)
         self.counts = self.counts.joined(described.counts)
         for column, seconds in described.stood_still.items():

@@ -12,19 +12,24 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict
-from datetime import datetime
+from datetime import UTC, datetime
 from ipaddress import ip_address
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+
+from daq.archive.index import IndexEntry
 from daq.archive.plan import Plan
+from daq.archive.spectra_file import Origin
 from daq.archive.store import Store
 from daq.archive.task import Outcome, Task, run, software_version
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
+from daq.formats.foreign_sensor import FIRST_DATE_NS
 from daq.python_process import python_command
 from daq.recording.reader import Recording
 
@@ -77,14 +82,31 @@ def begun(
     raise ArchiveError("\n".join(errors))
 
 
-def tasks_of(archive: Store, new: Sequence[tuple[str, Path, datetime]]) -> list[Task]:
-    """Return a task for each recording that is not in an archive yet."""
+def tasks_of(
+    archive: Store, new: Sequence[Origin], entries: Iterable[IndexEntry] = ()
+) -> list[Task]:
+    """Return a task for each recording that is not in an archive yet.
+
+    Of recordings that cover the same time, the one counts that is among `entries`, or comes first.
+    """
     plan, software = archive.plan.to_json(), software_version()
+    taken = {each.run_id for each in new}
+    known = [each.described for each in entries if each.described.origin.run_id not in taken]
+    origins = [each.origin for each in known] + [*new]
+    spans = np.array([(each.begin_ns, each.end_ns) for each in origins], np.int64).reshape(-1, 2)
     tasks = []
-    for run_id, path, begin in new:
-        target = archive.path_of(run_id, begin).resolve()
+    for number, origin in enumerate(new, start=len(known)):
+        begin = datetime.fromtimestamp(origin.begin_ns * 1e-9, UTC)
+        target = archive.path_of(origin.run_id, begin).resolve()
         target.parent.mkdir(exist_ok=True)
-        tasks.append(Task(str(path.resolve()), str(target), plan, software))
+        before, name = spans[:number], Path(origin.path).name
+        touches = (before[:, 0] < origin.end_ns) & (before[:, 1] > origin.begin_ns)
+        repeated = tuple(
+            (Path(origins[at].path).name, *spans[at].tolist())
+            for at in np.flatnonzero(touches & (before[:, 0] >= FIRST_DATE_NS)).tolist()
+            if at >= len(known) or all(each.counted != name for each in known[at].overlaps)
+        )
+        tasks.append(Task(origin.path, str(target), plan, software, repeated=repeated))
     return tasks
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.archive.index import IndexEntry
+from daq.archive.spectra_file import Origin
 from daq.archive.store import FOLDER, PLAN_FILE
 from daq.archive.task import origin_of
 from daq.errors import HuddleError, RecordingError, WrongArchiveError
@@ -22,15 +22,15 @@ class Sorted:
 
     Attributes
     ----------
-    new : list of (str, Path, datetime)
-        Run, path and begin of those to take: new ones, and those that have grown since.
+    new : list of Origin
+        Of those to take: new ones, and those that have grown since.
     current : list of Path
         Those that the archive has.
     failures : list of str
         A message for each that cannot be read.
     """
 
-    new: list[tuple[str, Path, datetime]] = field(default_factory=list)
+    new: list[Origin] = field(default_factory=list)
     current: list[Path] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
 
@@ -122,7 +122,6 @@ def sort(paths: Sequence[Path], entries: Iterable[IndexEntry]) -> Sorted:
                 continue
             with Recording.open(path) as recording:
                 origin = origin_of(recording)
-                begin = datetime.fromtimestamp(recording.created_at.utc_ns / 1e9, UTC)
         except (HuddleError, OSError) as error:
             found.failures.append(str(error))
             continue
@@ -134,6 +133,6 @@ def sort(paths: Sequence[Path], entries: Iterable[IndexEntry]) -> Sorted:
         if same or origin.run_id in seen:
             found.current.append(path)
         else:
-            found.new.append((origin.run_id, path, begin))
+            found.new.append(origin)
         seen.add(origin.run_id)
     return found

@@ -27,6 +27,7 @@ from daq.bench.channel import Channel
 from daq.bench.sensitivity import Sensitivities, as_document, sensitivities_from
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
+from daq.estimation.snapshot import Overlap, overlaps_from
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.packing import check_chunks
@@ -68,6 +69,8 @@ class Origin:
     responses : str
         SHA-256 of what files of responses said of its channels on this day; empty without such
         files.
+    begin_ns, end_ns : int
+        Of a recording, UTC; 0 if an earlier version took it.
     """
 
     run_id: str
@@ -78,6 +81,8 @@ class Origin:
     closed: bool
     files: str = ""
     responses: str = ""
+    begin_ns: int = 0
+    end_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +115,8 @@ class Described:
         Whether estimates are made of matrices that were kept in single precision.
     caveats : Caveats
         Earlier versions did not keep them.
+    overlaps : tuple of Overlap
+        With recordings whose segments count there.
     """
 
     origin: Origin
@@ -126,6 +133,7 @@ class Described:
     sensitivities: Sensitivities = field(default_factory=dict)
     rounded: bool = False
     caveats: Caveats = NO_CAVEATS
+    overlaps: tuple[Overlap, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,6 +282,8 @@ class SpectraWriter:
                 "source_closed": int(origin.closed),
                 "source_files": origin.files,
                 "source_responses": origin.responses,
+                "source_begin_ns": origin.begin_ns,
+                "source_end_ns": origin.end_ns,
                 "sensors": list(groups),
                 "usable": described.usable,
                 "elapsed": described.elapsed,
@@ -286,6 +296,7 @@ class SpectraWriter:
                 "lacking": json.dumps(dict(described.lacking)),
                 "shortened": json.dumps(dict(described.shortened)),
                 "sensitivities": json.dumps(as_document(described.sensitivities)),
+                "overlaps": json.dumps([asdict(each) for each in described.overlaps]),
                 "daily": int(self._daily),
                 "single": int(self._single),
             }
@@ -342,11 +353,10 @@ class SpectraFile:
                 modified_ns=int(number(attributes, "source_modified_ns")),
                 n_samples=int(number(attributes, "source_samples")),
                 closed=bool(number(attributes, "source_closed")),
-                **{
-                    name: text(attributes, f"source_{name}")
-                    for name in ("files", "responses")
-                    if f"source_{name}" in attributes  # since days of stations
-                },
+                files=str(attributes.get("source_files", "")),  # since days of stations
+                responses=str(attributes.get("source_responses", "")),
+                begin_ns=int(attributes.get("source_begin_ns", 0)),
+                end_ns=int(attributes.get("source_end_ns", 0)),
             ),
             channels=channels,
             usable=float(number(attributes, "usable")),
@@ -367,6 +377,7 @@ class SpectraFile:
                 for sensor, (late, early) in _table(attributes, "shortened", optional=True).items()
             },
             sensitivities=sensitivities_from(json.loads(attributes.get("sensitivities", "[]"))),
+            overlaps=overlaps_from(json.loads(attributes.get("overlaps", "[]"))),
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))

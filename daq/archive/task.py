@@ -73,6 +73,8 @@ class Task:
     question : str
         As JSON: settings and length of a stretch of a plan, or settings, time zone and probability
         of a false alarm of a summary.
+    repeated : tuple of (str, int, int)
+        Names, begins and ends (ns of UTC) of recordings whose segments count in this one's place.
     """
 
     source: str
@@ -81,6 +83,7 @@ class Task:
     software: str
     day: str = ""
     question: str = ""
+    repeated: tuple[tuple[str, int, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +169,11 @@ def origin_of(recording: Recording) -> Origin:
     """Return what a recording is now."""
     recording.refresh()
     about = recording.path.stat()
+    begin = recording.created_at.utc_ns
+    seconds = [
+        (sensor.n_samples + int(sensor.gaps["missing"].sum())) / sensor.sampling_rate
+        for sensor in recording.sensors
+    ]
     return Origin(
         run_id=recording.run_id,
         path=str(recording.path.resolve()),
@@ -173,6 +181,8 @@ def origin_of(recording: Recording) -> Origin:
         modified_ns=about.st_mtime_ns,
         n_samples=sum(sensor.n_samples for sensor in recording.sensors),
         closed=recording.closed,
+        begin_ns=begin,
+        end_ns=begin + round(max(seconds, default=0.0) * 1e9),
     )
 
 
@@ -204,6 +214,8 @@ def _written(
     with SpectraWriter(Path(task.target), n_freqs=n_freqs, n_channels=sum(plan.dims)) as writer:
         each = StretchPass(recording, plan, writer, day_ns)
         plan.check_fits(each)
+        for name, begin, end in task.repeated:
+            each.leave_to(name, (begin, end))
         each.doubt_stated_times()
         each.finish()
         each.end_stretch()
@@ -226,6 +238,7 @@ def _written(
             lacking=each.sets.lacking(each.n_channels),
             shortened=each.aligned.shortened,
             sensitivities=stated_sensitivities([recording]),
+            overlaps=tuple(each.overlaps),
         )
         noise = plan.noise_settings(settings)
         writer.commit(described, summaries(writer.rows(), described, plan, noise, each.changed))

@@ -169,7 +169,9 @@ class Estimation:
             self.settings = wanted.at(created_at(first))
             self._sensors = live_sensors(first, self.settings) if live else None
             self._sensors = self._sensors or recording_set.that_sent(self._recordings)
-            self._passes = [self._pass(recording) for recording in self._recordings]
+            self._passes: list[Pass] = []
+            for recording in self._recordings:
+                self._passes.append(self._pass(recording, self._passes))
             recording_set.check_same(self._passes)
             if not live:
                 announce(self._passes[0].n_channels, self._passes[0].welch)
@@ -209,8 +211,10 @@ class Estimation:
         self._snapshots.close()
         self.close()
 
-    def _pass(self, recording: ReadableRecording) -> Pass:
-        return Pass(recording, self.settings, self._sensors, jobs=self._jobs)
+    def _pass(self, recording: ReadableRecording, before: Sequence[Pass]) -> Pass:
+        found = Pass(recording, self.settings, self._sensors, jobs=self._jobs)
+        recording_set.leave_out_repeated(found, before)
+        return found
 
     @property
     def is_whole(self) -> bool:
@@ -323,7 +327,7 @@ class Estimation:
         for number, each in enumerate(self._passes):
             each.aligned.refresh()
             if each.n_seen and not each.aligned.is_exact:
-                self._passes[number] = self._pass(each.recording)
+                self._passes[number] = self._pass(each.recording, self._passes[:number])
             if not self._passes[number].shows_drifts:
                 self._passes[number].doubt_stated_times()
         recording_set.check_span(self._passes, self.settings)
@@ -398,7 +402,7 @@ class Estimation:
             return
         self._open_continuations()
         for recording in self._recordings[len(self._passes) :]:
-            self._passes.append(self._pass(recording))
+            self._passes.append(self._pass(recording, self._passes))
             recording_set.check_same(self._passes)
         self._filter()
 

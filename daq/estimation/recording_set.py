@@ -7,15 +7,20 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
 from daq.bench.durations import format_duration
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError, RecordingError, WrongSettingError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
+from daq.formats.foreign_sensor import FIRST_DATE_NS
 from daq.recording.interface import ReadableRecording
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import continuation_names
+
+_COMPARED = 1000  # samples of each sensor
 
 
 def open_another(
@@ -144,6 +149,32 @@ def check_same(passes: Sequence[Pass]) -> None:
                 f" {_described(other)} against {_described(first)};"
                 " one estimate takes recordings of the same sensors at one sampling rate"
             )
+
+
+def leave_out_repeated(each: Pass, before: Sequence[Pass]) -> None:
+    """Exclude from a recording the time that others cover: segments do not count twice.
+
+    Recordings without a date share a start: these cover one time only if their samples are equal.
+    """
+    for other in before:
+        span, own = other.span_ns, each.span_ns
+        if span is None or own is None:
+            continue
+        dated = min(span[0], own[0]) >= FIRST_DATE_NS
+        if dated:
+            each.leave_to(other.recording.path.name, span)
+        elif _begin_alike(each.recording, other.recording):
+            length = span[1] - span[0]
+            each.leave_to(other.recording.path.name, (own[0], own[0] + length), dated=False)
+
+
+def _begin_alike(one: ReadableRecording, other: ReadableRecording) -> bool:
+    """Return whether the first samples of two recordings are equal."""
+    pairs = [
+        [sensor.intact_counts(0, min(_COMPARED, sensor.n_samples))[0] for sensor in each.sensors]
+        for each in (one, other)
+    ]
+    return all(map(np.array_equal, *pairs)) and any(np.ptp(counts) for counts in pairs[0])
 
 
 def check_span(passes: Sequence[Pass], settings: Settings) -> None:

@@ -143,6 +143,24 @@ class NoSegment:
 
 
 @dataclass(frozen=True, slots=True)
+class Overlap:
+    """Two recordings, by name, that cover the same time, in ns of UTC; None if they have no date.
+
+    `repeated` is the one whose segments there do not count.
+    """
+
+    counted: str
+    repeated: str
+    time_utc_ns: tuple[int, int] | None
+    seconds: float
+
+
+def overlaps_from(found: Iterable[dict[str, Any]]) -> tuple[Overlap, ...]:
+    """Return overlaps from JSON."""
+    return tuple(Overlap(**each | {"time_utc_ns": tuple(each["time_utc_ns"])}) for each in found)
+
+
+@dataclass(frozen=True, slots=True)
 class RejectedSegment:
     """A segment that is left out for a transient, the largest of which is in channel `column`."""
 
@@ -256,6 +274,8 @@ class Snapshot:
         None where no segment with gaps counts.
     left_open : tuple of str
         Names of recordings whose recorder was killed. Of a finished estimate.
+    overlaps : tuple of Overlap
+        Recordings that cover the same time.
     not_estimated : tuple of str
         Sensors that sent nothing, and those that a live estimate leaves out to limit its memory.
     across_axes : tuple of float
@@ -310,6 +330,7 @@ class Snapshot:
     linearised: bool = False
     bridged: Bridged | None = None
     left_open: tuple[str, ...] = ()
+    overlaps: tuple[Overlap, ...] = ()
     not_estimated: tuple[str, ...] = ()
     across_axes: tuple[float, ...] = ()
     rounding: float = 0.0

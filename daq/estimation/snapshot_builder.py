@@ -345,6 +345,7 @@ class SnapshotBuilder:
             drift=last_aligned(passes).drift(),
             closed=all(map(is_complete, recordings, (*recordings[1:], None))),
             left_open=left_open(recordings) if final else (),
+            overlaps=tuple(overlap for each in passes for overlap in each.overlaps),
             left_out=_left_out(passes, sum(each.n_segments for each in sets) - n_unused),
             channel_segments=_segments_of(sets, n_segments if raw else 0, first.n_channels),
             octaves=_octaves(bands, sets) if self._settings.octaves else (),

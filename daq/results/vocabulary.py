@@ -38,6 +38,7 @@ REASONS: Mapping[Reason, str] = {
     Reason.CLIPPED: "where a sensor is at the end of its range",
     Reason.TRANSIENT: "with a transient",
     Reason.CHOSEN: "by choice of the time (--exclude)",
+    Reason.REPEATED: "of times that another recording covers",
 }
 """Why segments were excluded; the text follows their number."""
 

@@ -47,6 +47,7 @@ class Reason(enum.StrEnum):
     CLIPPED = "clipped"
     TRANSIENT = "transient"
     CHOSEN = "chosen"
+    REPEATED = "repeated"
 
 
 @dataclass(frozen=True, slots=True)

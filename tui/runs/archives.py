@@ -84,14 +84,14 @@ class Filling:
         """Take what is new; yield a message for each recording that failed."""
         with archive.writing() as n_unfinished:
             self._say_unfinished(n_unfinished, "recordings")
-            found = sort(paths, archive.entries()[0])
+            entries, _ = archive.entries()
+            found = sort(paths, entries)
             n_current = len(found.current)
             new = several(len(found.new), "recording")
             self.say(f"{new} to take, {n_current} in the archive already")
             yield from found.failures
-            tasks = execution.tasks_of(archive, found.new)
-            known = zip(tasks, found.new, strict=True)
-            sizes = {task.source: path.stat().st_size for task, (_, path, _) in known}
+            tasks = execution.tasks_of(archive, found.new, entries)
+            sizes = {each.path: each.n_bytes for each in found.new}
             for outcome in self.watched(self.run(tasks), sizes, "recordings") if tasks else ():
                 if outcome.failure:
                     yield execution.failure_of(outcome)

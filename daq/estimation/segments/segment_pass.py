@@ -26,6 +26,7 @@ from daq.estimation.segments.flatline import FlatlineDetector, stands_still
 from daq.estimation.segments.own_spectra import OwnSpectra, need_samples_of_grid
 from daq.estimation.segments.stated_times import agree, compare
 from daq.estimation.settings import Settings
+from daq.estimation.snapshot import Overlap
 from daq.recording.interface import ReadableRecording, at_rates, created_at
 from estimator.records import dataclass
 from estimator.spectra.channel_sets import ChannelSets
@@ -33,7 +34,13 @@ from estimator.spectra.equaliser import Equaliser
 from estimator.spectra.multiresolution import MultiResolution
 from estimator.spectra.parts import MOST, PartEnds, Parts, PieceEnds, by_part, part_bins
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
-from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins, kept_rows
+from estimator.spectra.welch import (
+    CrossSpectra,
+    SegmentSpectra,
+    WelchSettings,
+    kept_bins,
+    kept_rows,
+)
 from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
 
 FloatArray = NDArray[np.float64]
@@ -218,6 +225,8 @@ class Pass:
         created = created_at(recording)
         ends = (stretch(each, created) for each in settings.exclude)
         self._stretches = [(_ns(begin), _ns(end)) for begin, end in ends]
+        self._n_chosen = len(self._stretches)
+        self.overlaps: list[Overlap] = []
         self.filters: Equaliser | None = None
         self._every = 1  # of which segments delays are measured
         self._tolerance = _FINAL_TOLERANCE
@@ -722,9 +731,7 @@ class Pass:
         whole = whole_segments(usable, starts, length)
         clean = whole if unwanted is None else whole_segments(usable & ~unwanted, starts, length)
         self.left_out[Reason.GAP] += count - int(whole.sum())
-        chosen = self._touch_excluded(begin + starts, length + 2 * reach)
-        self.left_out[Reason.CHOSEN] += int((whole & chosen).sum())
-        self.left_out[Reason.CLIPPED] += int((whole & ~clean & ~chosen).sum())
+        self._count_left_out(whole, clean, begin + starts, length + 2 * reach)
         starts = starts[clean]
         if self.octaves is not None:
             present = usable if part.present is None else part.present
@@ -764,9 +771,7 @@ class Pass:
         spectra = part.spectra
         if unwanted is not None:
             clean = whole_segments(~unwanted, starts, length)
-            chosen = self._touch_excluded(first * hop + starts, length)
-            self.left_out[Reason.CHOSEN] += int(chosen.sum())
-            self.left_out[Reason.CLIPPED] += int((~clean & ~chosen).sum())
+            self._count_left_out(np.ones_like(clean), clean, first * hop + starts, length)
             if not clean.all():
                 spectra, starts = spectra[clean], starts[clean]
         begins = first * hop + starts
@@ -798,10 +803,46 @@ class Pass:
         edges = ((np.array(each) - origin) * 1e-9 * rate for each in self._stretches)
         return [(int(first), int(end)) for first, end in (np.ceil(at - _NEAR) for at in edges)]
 
-    def _touch_excluded(self, begins: NDArray[np.int64], length: int) -> BoolArray:
+    def leave_to(self, name: str, span: tuple[int, int], *, dated: bool = True) -> None:
+        """Exclude what another recording covers, in ns of UTC, but for half a segment at its ends.
+
+        So nothing is excluded where one recording continues another. Times of recordings that are
+        not `dated` are not stated.
+        """
+        margin = round(self.welch.segment_length / self.welch.sampling_rate * 5e8)
+        low, high = span[0] + margin, span[1] - margin
+        own = self.span_ns
+        if own is not None and max(low, own[0]) < min(high, own[1]):
+            self._stretches.append((low, high))
+            both = max(span[0], own[0]), min(span[1], own[1])
+            time, seconds = both if dated else None, (both[1] - both[0]) * 1e-9
+            self.overlaps.append(Overlap(name, self.recording.path.name, time, seconds))
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Begin and end of the grid in ns of UTC; None before all sensors have samples."""
+        begin, seconds = (
+            self.aligned.start_utc_ns,
+            self.aligned.n_available / self.welch.sampling_rate,
+        )
+        return (begin, begin + round(seconds * 1e9)) if self.aligned.clocks else None
+
+    def _count_left_out(
+        self, whole: BoolArray, clean: BoolArray, begins: NDArray[np.int64], length: int
+    ) -> None:
+        """Count segments without gaps that do not count, by their reasons."""
+        excluded = self._touch_excluded(begins, length)
+        chosen = self._touch_excluded(begins, length, self._n_chosen)
+        self.left_out[Reason.CHOSEN] += int((whole & chosen).sum())
+        self.left_out[Reason.REPEATED] += int((whole & excluded & ~chosen).sum())
+        self.left_out[Reason.CLIPPED] += int((whole & ~clean & ~excluded).sum())
+
+    def _touch_excluded(
+        self, begins: NDArray[np.int64], length: int, most: int | None = None
+    ) -> BoolArray:
         """Return which segments that begin at these grid samples touch an excluded stretch."""
         found = np.zeros(len(begins), dtype=np.bool_)
-        for first, end in self.excluded():
+        for first, end in self.excluded()[:most]:
             found |= (begins < end) & (begins + length > first)
         return found
 

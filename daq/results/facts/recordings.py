@@ -45,6 +45,29 @@ class RecordingLeftOpen(Fact):
         return Words(f"{text}: huddle repair closes it", f"{text}. All saved samples count.", do)
 
 
+class RecordingsOverlap(Fact):
+    """Two recordings cover the same time; of `repeated` no segment in it counts.
+
+    Attributes
+    ----------
+    duration : float
+        Of the time in both.
+    """
+
+    counted: str
+    repeated: str
+    duration: Seconds
+
+    def _words(self) -> Words:
+        text = f"{self.counted} and {self.repeated} cover the same {clock_time(self.duration)}"
+        at = f", from {time_of_day(self.time_utc_ns[0])} UTC on" if self.time_utc_ns else ""
+        return Words(
+            f"{text}, which counts once",
+            f"{text}{at}: segments of {self.repeated} in it are excluded.",
+            "If the times of one are wrong, correct them and import it again.",
+        )
+
+
 class SensorLost(Fact):
     """A sensor sent nothing from `time_utc_ns` on.
 
@@ -200,6 +223,14 @@ def facts_of_recordings(snapshot: Snapshot) -> Iterator[Fact]:
         yield _OF_CAVEATS[caveat](rank=Rank.TO_KNOW)
     for file in snapshot.left_open:
         yield RecordingLeftOpen(rank=Rank.DELAYS, file=file)
+    for both in snapshot.overlaps:
+        yield RecordingsOverlap(
+            rank=Rank.DELAYS if both.seconds > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
+            counted=both.counted,
+            repeated=both.repeated,
+            time_utc_ns=both.time_utc_ns,
+            duration=both.seconds,
+        )
     for sensor in snapshot.sensors:
         if sensor.is_lost:
             yield _lost(snapshot, sensor)

@@ -50,6 +50,9 @@ class NoSegmentUsable(Fact):
         elif self.reason is Reason.CHOSEN:
             text = f"{head} their time is excluded by choice."
             do = "Exclude less (--exclude)."
+        elif self.reason is Reason.REPEATED:
+            text = f"{head} another recording covers their time."
+            do = "Estimate each recording alone."
         else:
             text = f"{head} there are transients."
             do = "Wait for a quieter time, or leave out --reject."

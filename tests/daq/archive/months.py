@@ -105,8 +105,9 @@ def store_for(
 
 def fill(store: Store, paths: Sequence[Path], *, jobs: int = 1) -> list[str]:
     """Take what is new into an archive; returns failures."""
-    found = sort(paths, store.entries()[0])
-    outcomes = carried_out(tasks_of(store, found.new), jobs=jobs)
+    entries, _ = store.entries()
+    found = sort(paths, entries)
+    outcomes = carried_out(tasks_of(store, found.new, entries), jobs=jobs)
     return found.failures + [each.failure for each in outcomes if each.failure]
 
 

@@ -131,8 +131,24 @@ def test_only_new_recordings_are_processed(paths: list[Path], copy: Store, tmp_p
     shutil.copyfile(paths[0], moved)  # another name and time, the same run
     longer = record(tmp_path / "four.h5", begin_ns=START_NS + 50 * HOUR_NS, seed=4)
     found = sort([moved, *paths, longer], copy.entries()[0])
-    assert [path for _, path, _ in found.new] == [longer]
+    assert [Path(each.path) for each in found.new] == [longer]
     assert found.current == [moved, *paths]
+
+
+def test_what_two_recordings_cover_counts_once(paths: list[Path], tmp_path: Path) -> None:
+    """In one command, or in two; that which is not new counts."""
+    again = record(tmp_path / "again.h5", hours=2, begin_ns=START_NS + 2 * HOUR_NS // 3)
+    for name, pieces in (("one", [[paths[0], again]]), ("two", [[paths[0]], [again]])):
+        store = store_for(tmp_path / name, paths[0])
+        for some in pieces:
+            assert fill(store, some) == []
+        entries = store.entries()[0]
+        (n_first, n_again) = (entry.n_segments for entry in entries)
+        assert n_first == pytest.approx(1.5 * 720, abs=2)
+        assert n_again == pytest.approx(0.5 * 720, abs=3)
+        (overlap,) = answer(store, entries, SETTINGS).pooled.overlaps
+        assert overlap.repeated == "again.h5"
+        assert overlap.seconds == pytest.approx(5400, abs=1)
 
 
 def test_a_grown_recording_replaces_its_earlier_spectra(paths: list[Path], copy: Store) -> None:

@@ -219,7 +219,7 @@ def test_clipped_blocks_are_left_out_unless_that_is_turned_off(tmp_path: Path) -
     found = estimate([write(tmp_path / "r.h5", sensors, clipped)], SETTINGS)
     assert not found.diagnostics.counts.clipped  # what says so itself is left out
     kept = [start for start in range(0, N_SAMPLES - 99, 50) if not 4900 < start < 5200]
-    assert found.left_out == {"gap": 0, "clipped": 5, "transient": 0, "chosen": 0}
+    assert found.left_out == {"gap": 0, "clipped": 5, "transient": 0, "chosen": 0, "repeated": 0}
     direct = spectra_of(sensors, kept).csm()
     np.testing.assert_allclose(found.csm[2:], direct[2:], rtol=1e-9, atol=1e-3)
     assert estimate([tmp_path / "r.h5"], replace(SETTINGS, reject=False)).n_dropped == 0
@@ -306,8 +306,9 @@ def test_octaves_join_at_the_true_noise_from_far_below_one_over_the_segment(tmp_
 
 
 def test_octaves_of_several_recordings_add(tmp_path: Path) -> None:
-    sensors = bench(n_samples=3000)
-    paths = [write(tmp_path / name, sensors) for name in ("1.h5", "2.h5")]
+    sensors = {name: replace(each, utc=True) for name, each in bench(n_samples=3000).items()}
+    later = {name: replace(each, start=60.0) for name, each in sensors.items()}
+    paths = [write(tmp_path / "1.h5", sensors), write(tmp_path / "2.h5", later)]
     settings = replace(SETTINGS, octaves=True, methods=("three-sensor",))
     once, twice = estimate(paths[:1], settings), estimate(paths, settings)
     assert twice.octaves[-1].n_segments == 2 * once.octaves[-1].n_segments
@@ -388,7 +389,7 @@ def test_samples_that_are_no_numbers_are_gaps(tmp_path: Path) -> None:
     sensors["c"].counts[7030, 0] = -np.inf
     found = estimate([write(tmp_path / "r.h5", sensors)], SETTINGS)
     # 2950, 3000; 6950, 7000
-    assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0, "chosen": 0}
+    assert found.left_out == {"gap": 4, "clipped": 0, "transient": 0, "chosen": 0, "repeated": 0}
     assert np.isfinite(found.results["three-sensor"].noise_psd[2:]).all()
 
 

@@ -174,13 +174,14 @@ def test_a_disturbed_segment_is_left_out_where_that_is_asked_for(tmp_path: Path)
     quiet = estimate([path], replace(SETTINGS, reject=True))
     # Lattice segments at 3950 and 4000.
     assert everything.n_segments - quiet.n_segments == 2
-    assert quiet.left_out == {"gap": 0, "clipped": 0, "transient": 2, "chosen": 0}
+    assert quiet.left_out == {"gap": 0, "clipped": 0, "transient": 2, "chosen": 0, "repeated": 0}
     assert quiet.data_psd[2:6, 2].max() < 0.2 * everything.data_psd[2:6, 2].min()
 
 
 def test_several_recordings_accumulate(tmp_path: Path) -> None:
-    one, two = huddle(seed=1), huddle(4000, seed=9)
-    first, second = write(tmp_path / "1.h5", one), write(tmp_path / "2.h5", two)
+    one, two = huddle(seed=1), huddle(4000, seed=9, utc=True)
+    later = {name: replace(sensor, start=60.0) for name, sensor in two.items()}
+    first, second = write(tmp_path / "1.h5", one), write(tmp_path / "2.h5", later)
     both = estimate([first, second], SETTINGS)
     alone = estimate([first], SETTINGS), estimate([second], SETTINGS)
     assert both.n_segments == sum(each.n_segments for each in alone)

@@ -21,6 +21,7 @@ from daq.estimation.estimation import estimate
 from daq.estimation.segments import clipping
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
+from daq.results.facts.recordings import RecordingsOverlap
 from daq.results.facts.segments import SegmentsExcluded
 from daq.results.result import Result
 from estimator.checks.advice import Rank
@@ -44,10 +45,11 @@ def recording(
     path: Path,
     disturbance: float,
     fault: Fault = lambda counts: counts,
+    seed: int = 4,
     **of_sensor: Any,  # noqa: ANN401 - fields of Sensor
 ) -> Path:
     """Write three sensors with common motion, all but alike: what B reads in `LORRY` differs."""
-    rng = np.random.default_rng(4)
+    rng = np.random.default_rng(seed)
     motion = rng.normal(0, 300, RATE * SECONDS)
     sensors = {}
     for name in "ABC":
@@ -130,6 +132,37 @@ def test_instants_and_times_after_the_start_are_alike(tmp_path: Path) -> None:
     facts = Result(found[0], Settings(segment=4.0, exclude=(EXCLUDED,))).facts
     (fact,) = (each for each in facts if isinstance(each, SegmentsExcluded))
     assert fact.words.explanation == "8 segments excluded by choice of the time (--exclude)."
+
+
+@pytest.mark.parametrize("options", [{"clocks": "nominal"}, {}])
+def test_what_two_recordings_cover_counts_once(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Another name, and another run: an export made twice, or two recorders on the sensors."""
+    first = recording(tmp_path / "a.h5", 0, utc=True)
+    again = recording(tmp_path / "b.h5", 0, utc=True)
+    settings = Settings(segment=4.0, **options)
+    alone, both = estimate([first], settings), estimate([first, again], settings)
+    assert both.n_segments == alone.n_segments == both.left_out[Reason.REPEATED]
+    for method, found in alone.results.items():
+        np.testing.assert_allclose(both.results[method].noise_psd, found.noise_psd, rtol=1e-9)
+    (fact,) = (f for f in Result(both, settings).facts if isinstance(f, RecordingsOverlap))
+    assert (fact.counted, fact.repeated, fact.rank) == ("a.h5", "b.h5", Rank.DELAYS)
+    assert fact.duration == pytest.approx(SECONDS, abs=1)
+
+
+def test_recordings_without_a_date_count_unless_their_samples_are_equal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_set, "FIRST_DATE_NS", 2**62)
+    first, again, other = (
+        recording(tmp_path / f"{name}.h5", 0, seed=seed, utc=True)
+        for name, seed in (("a", 4), ("b", 4), ("c", 5))
+    )
+    settings = Settings(segment=4.0)
+    found = estimate([first, again, other], settings)
+    assert found.n_segments == 2 * estimate([first], settings).n_segments
+    assert [(o.counted, o.repeated, o.time_utc_ns) for o in found.overlaps] == [
+        ("a.h5", "b.h5", None)
+    ]
 
 
 def test_arrival_times_are_read_once_more_for_a_refusal_alone(

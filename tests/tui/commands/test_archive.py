@@ -23,6 +23,7 @@ from daq.archive.changes import Interval
 from daq.archive.store import Store
 from daq.bench.masks.mask_file import masks_named
 from daq.estimation.snapshot import Snapshot
+from daq.protocols.block import HostTime
 from daq.python_process import python_command
 from tests import command as commands
 from tests import known_clocks
@@ -313,10 +314,13 @@ def test_figures_have_a_panel_a_channel_with_what_was_found(tmp_path: Path) -> N
             assert box.y0 >= max(axes.title.get_window_extent().y1 for axes in figure.axes[:6])
 
 
-def test_a_recording_whose_clock_is_not_understood_is_named(tmp_path: Path) -> None:
+def test_a_recording_whose_clock_is_not_understood_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = Scene(rates=(20.0,) * 3, seconds=200.0)
     known_clocks.record(tmp_path / "good.h5", scene)
     fast = (Oscillator(), Oscillator(400.0), Oscillator())
+    monkeypatch.setattr(known_clocks, "_ORIGIN", HostTime(0, 1_468_458_600 * 10**9))  # later
     known_clocks.record(tmp_path / "bad.h5", replace(scene, clocks=fast))
     said = huddle(tmp_path, *OPTIONS, "--json", tmp_path / "a.json")
     assert "the clock of B is not understood in it (bad.h5)" in " ".join(said.output.split())

@@ -75,6 +75,7 @@ from daq.results.facts.recordings import (
     ChannelsStuck,
     NotInLiveEstimate,
     RecordingLeftOpen,
+    RecordingsOverlap,
     SamplesMissing,
     SensorClipping,
     SensorLost,
@@ -158,6 +159,13 @@ EXAMPLES: tuple[Fact, ...] = (
     ),
     NoSegmentUsable(rank=Rank.INVALIDATES, sensors=A, segment=10.0, reason=Reason.GAP, longest=4.0),
     RecordingLeftOpen(rank=Rank.DELAYS, file="night.h5"),
+    RecordingsOverlap(
+        rank=Rank.DELAYS,
+        time_utc_ns=(NOON, NOON + 397 * 10**9),
+        counted="night.h5",
+        repeated="copy.h5",
+        duration=397.0,
+    ),
     NotInLiveEstimate(rank=Rank.TO_KNOW, sensors=A, n_all=3),
     SensorLost(
         rank=Rank.DELAYS,
