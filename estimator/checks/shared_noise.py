@@ -8,7 +8,7 @@ the averages, as for waves across the bench, none is reported.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import combinations
@@ -21,7 +21,7 @@ from estimator.likelihood.factor_analysis import Maximum
 from estimator.likelihood.goodness_of_fit import REJECT, upper_tail
 from estimator.likelihood.score_test import Scores, pair_scores, shift, usable
 from estimator.likelihood.shared_by_two import SHARING
-from estimator.median import median
+from estimator.median import median_of_columns
 from estimator.records import dataclass
 from estimator.self_noise.three_sensor import three_sensor
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -32,7 +32,9 @@ BAND_SIGNIFICANCE = 3.0
 """Standard deviations from which a band shows shared noise of pairs already found."""
 OF_BANDS = 0.5
 """Level of all single bands together, over that of all frequencies."""
-LEVEL = REJECT / 3 / (1 + OF_BANDS)
+DELAYED = 0.5
+"""Level of noise that is shared with a delay, over that of noise that is shared at once."""
+LEVEL = REJECT / 3 / (1 + OF_BANDS) / (1 + DELAYED)
 """Probability that a sound test is accused at all frequencies together. Shared noise that is not
 there makes a sound result useless; thrice as rare, it is found from amounts 5 to 9 % larger on."""
 SMALL_PART = 0.1
@@ -132,18 +134,21 @@ def shared_noise(
     """
     if sum(dims) > MAX_CHANNELS:
         return None
-    found = [
-        pair_scores(maximum, band, n_effective=n_effective, neighbours=neighbours) for band in bands
-    ]
-    known = [number for number, each in enumerate(found) if each is not None]
     of_band = np.broadcast_to(inflation, (len(bands),)).tolist()
-    scores = {
-        number: each.deflated(of_band[number])
-        for number, each in enumerate(found)
-        if each is not None
-    }
+
+    def of(fit: Maximum) -> dict[int, Scores]:
+        found = (
+            pair_scores(fit, each, n_effective=n_effective, neighbours=neighbours) for each in bands
+        )
+        return {n: each.deflated(of_band[n]) for n, each in enumerate(found) if each is not None}
+
+    scores = of(maximum)
+    known = [*scores]
     if not known:
         return None
+    turned = _without_delay(maximum, scores, of, dims)
+    if turned is not None:
+        maximum, scores = turned
     whole = reduce(add, scores.values())
     groups = _groups(whole, dims)
     chosen, of_bands = stepwise(whole, LEVEL, groups), tuple(known)
@@ -168,13 +173,15 @@ def shared_noise(
         for step in range(len(chosen))
         for other in _alternatives(there, chosen, step, dims)
     ]
-    choices = [chosen] + [_in_place(chosen, step, other) for step, other in others]
-    inside = np.any([bands[n] for n in of_bands], axis=0)
+    steps = np.arange(len(chosen))
+    choices = [chosen] + [np.where(steps == step, other, chosen) for step, other in others]
+    inside = [bands[n] for n in of_bands]  # with a delay, the effect turns over bands
     closed, likely = (
         _largest(np.array(biases))
         for biases in zip(
             *(
-                _effect(maximum, inside, there, each, dims=dims, n_effective=n_effective)
+                _effect(maximum, part, there, each, dims=dims, n_effective=n_effective)
+                for part in (inside if turned else [np.any(inside, axis=0)])
                 for each in choices
             ),
             strict=True,
@@ -196,6 +203,35 @@ def shared_noise(
         maximum_likelihood=likely,
         explained=np.array(explained),
     )
+
+
+def _without_delay(
+    maximum: Maximum,
+    scores: Mapping[int, Scores],
+    of: Callable[[Maximum], dict[int, Scores]],
+    dims: tuple[int, ...],
+) -> tuple[Maximum, dict[int, Scores]] | None:
+    """Return a fit in which the noise that two sensors share is in phase, and its scores.
+
+    One of them is turned at all its channels. None where no noise is shared with a delay, at all
+    frequencies or in one band.
+    """
+    sensor = np.repeat(np.arange(len(dims)), dims)
+    each_band = [([n], OF_BANDS * LEVEL / len(scores)) for n in scores]
+    for some, level in [([*scores], LEVEL), *each_band]:
+        before = reduce(add, (scores[n] for n in some))
+        one, other = sensor[before.pairs].T
+        late = before.latest(one != other, DELAYED * level)
+        if late is None:
+            continue
+        pair, phase, turn, limit = late
+        by = np.exp(1j * (phase + turn * np.arange(len(maximum.psi))))
+        turned = maximum.turned(np.flatnonzero(sensor == other[pair]), by)
+        anew = of(turned)
+        after = reduce(add, (anew[n] for n in some))
+        if after.z[pair] ** 2 - before.z[pair] ** 2 > limit:
+            return turned, anew
+    return None
 
 
 def stepwise(scores: Scores, level: float, groups: Sequence[IntArray]) -> IntArray | None:
@@ -262,13 +298,6 @@ def _alternatives(scores: Scores, chosen: IntArray, step: int, dims: tuple[int, 
     if len(dims) == sum(dims) == SHARING:
         alike |= ~np.isin(scores.pairs, scores.pairs[chosen[step]]).any(axis=1)
     return np.setdiff1d(np.flatnonzero(alike), chosen)
-
-
-def _in_place(chosen: IntArray, step: int, other: int) -> IntArray:
-    """Return the chosen pairs with another in the place of one."""
-    changed = chosen.copy()
-    changed[step] = other
-    return changed
 
 
 def _groups(scores: Scores, dims: tuple[int, ...]) -> list[IntArray]:
@@ -339,16 +368,10 @@ def _effect(
         closed = (off - three_sensor(sound, dims=dims, n_effective=MANY).noise_psd) / psi
     likely = shift(maximum, rows, scores, amounts, dims=dims)
     likely = np.expm1(np.clip(likely, -MAX_SHIFT, MAX_SHIFT))
-    return _median(closed), _median(likely)
+    return median_of_columns(closed), median_of_columns(likely)
 
 
 def _largest(biases: FloatArray) -> FloatArray:
     """Return the number of largest magnitude of each column; NaN without any."""
     rows = np.argmax(np.nan_to_num(np.abs(biases)), axis=0)
     return np.asarray(np.take_along_axis(biases, rows[None], axis=0)[0])
-
-
-def _median(values: FloatArray) -> FloatArray:
-    """Return the median of the finite numbers of each column; NaN without any."""
-    known = [column[np.isfinite(column)] for column in values.T]
-    return np.array([float(median(each)) if len(each) else math.nan for each in known])

@@ -116,7 +116,8 @@ class Maximum:
     eigenvectors : complex128, shape (n_freqs, n_channels, n_factors)
         Their eigenvectors, as columns.
     rest : float64, shape (n_freqs, n_channels, n_channels)
-        Real part of the whitened matrix without them.
+        Real part plus imaginary part of the whitened matrix without them: the real part is its
+        symmetric part, the imaginary part its antisymmetric part.
     root : complex128, shape (n_freqs, n_pairs)
         Elements within the sensors (`estimator.levels.noise_matrices.pairs`) of V over the root of
         psi, ``N = V V*``; ones with sensors of one channel.
@@ -160,6 +161,21 @@ class Maximum:
     def projector(self) -> ComplexArray:
         """Projector on the directions without motion, shape (n_freqs, n_channels, n_channels)."""
         return _beside(self.eigenvectors)
+
+    @property
+    def residual(self) -> ComplexArray:
+        """Whitened matrix without motion less its expectation, of the shape of `rest`."""
+        mirrored = self.rest.swapaxes(1, 2)
+        whole = (self.rest + mirrored) / 2 + 0.5j * (self.rest - mirrored)
+        return np.asarray(whole - self.projector)
+
+    def turned(self, channels: IntArray, by: ComplexArray) -> Maximum:
+        """Return the fit of some channels times a unit number at each frequency, (n_freqs,)."""
+        turn = np.ones(self.psi.shape, np.complex128)
+        turn[:, channels] = by[:, None]
+        u = self.eigenvectors * turn[:, :, None]
+        rest = _beside(u) + self.residual * turn[:, :, None] * turn[:, None, :].conj()
+        return replace(self, eigenvectors=u, rest=rest.real + rest.imag)
 
     @property
     def noise_root(self) -> ComplexArray:
@@ -508,7 +524,7 @@ def _of_noise(
         turn = axes_of(-(u @ _adjoint(u))[:, a, b], np.full(psi.shape, -np.inf), sensor)[1]
         final, u, rest = final @ turn, _adjoint(turn) @ u, _adjoint(turn) @ rest @ turn
     yield "root", (final / np.sqrt(psi)[:, :, None])[:, a, b]
-    yield "rest", rest.real
+    yield "rest", rest.real + rest.imag
     yield "eigenvectors", u
 
 

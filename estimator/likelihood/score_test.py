@@ -12,10 +12,14 @@ each frequency. The coherency is constant over a band, so scores and information
 detects 3 % of shared noise that the likelihood ratio against any covariance does not detect. The
 scores of all pairs are jointly normal, with covariance information over averages, so regression
 separates the pairs.
+
+Noise that arrives later at one of them has a complex coherency, whose phase turns over frequencies:
+the transform of ``E_ij`` finds the delay (`Scores.latest`), and one sensor is turned back by it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -39,7 +43,12 @@ RESOLVED = 0.05
 """Maximum scatter of the directions of the motion for normal scores."""
 TESTABLE = 2e-3
 """Minimum information on a tested pair, as a fraction of that on the best pair."""
+BLOCK = 4
+"""Neighbouring frequencies that are summed before delays are tried."""
+LONGEST = 1 / 16
+"""Longest delay that is tried, over the length of a segment: blocks lose a tenth of its scores."""
 _SMALLEST = 1e-9
+_Z = 6.0  # or less, at the limit of scores of all delays
 _FEW = 16  # pairs whose information with all others is found for each
 _KEPT = 0.03  # fraction of the largest eigenvalue: smaller directions of the statistic are scatter
 
@@ -63,6 +72,12 @@ class Scores:
     averages : float
         Number of independent averages of the sum: the factor of `score` and `information`.
     n_frequencies : int
+    parts : complex128, shape (n_blocks, n_pairs)
+        Sums of ``E_ij`` over blocks of `BLOCK` frequencies.
+    block : int64, shape (n_blocks,)
+        Their numbers, from the first frequency.
+    across : float64, shape (n_pairs,)
+        As `power`, for noise a quarter of a turn apart.
     """
 
     pairs: IntArray
@@ -71,6 +86,9 @@ class Scores:
     between: Callable[[IntArray | None], FloatArray]
     averages: float
     n_frequencies: int
+    parts: ComplexArray
+    block: IntArray
+    across: FloatArray
 
     def __add__(self, other: Scores) -> Scores:
         """Return the combined scores of two bands, each by its own averages."""
@@ -82,6 +100,9 @@ class Scores:
             lambda some: self.between(some) + share * other.between(some),
             self.averages,
             self.n_frequencies + other.n_frequencies,
+            np.concatenate([self.parts, share * other.parts]),
+            np.concatenate([self.block, other.block]),
+            self.across + share * other.across,
         )
 
     def deflated(self, inflation: float) -> Scores:
@@ -129,6 +150,52 @@ class Scores:
         kept = w > _KEPT * max(float(w.max(initial=0.0)), _SMALLEST)
         projected = u[:, kept].T @ self.score[some]
         return float(self.averages * np.sum(projected**2 / w[kept])), int(kept.sum())
+
+    def latest(self, some: BoolArray, level: float) -> tuple[int, float, float, float] | None:
+        """Return the pair whose noise is most alike, one of the two being late or out of phase.
+
+        ``E_ij`` turns by 2 pi times the delay and the frequency: of all delays, the sum over the
+        frequencies is largest for the right one. Its square, over its variance at the mean phase,
+        exceeds z**2 about ``0.72 z exp(-z**2 / 2)`` times a delay where no noise is shared.
+
+        Parameters
+        ----------
+        some : bool, shape (n_pairs,)
+            Pairs to try.
+        level : float
+            Probability that any exceeds the limit if none shares noise.
+
+        Returns
+        -------
+        pair : int
+        phase, turn : float
+            Of the first channel over the second, at frequency 0 and per frequency, rad.
+        limit : float
+            Of the square of z.
+        None if none exceeds it.
+        """
+        power = (self.power + self.across) / 2
+        tried = np.flatnonzero(some & (power > TESTABLE * self.n_frequencies))
+        if not len(tried):
+            return None
+        block = self.block - self.block.min()
+        spectra = np.zeros((2 * (block.max() + 1), len(tried)), np.complex128)
+        np.add.at(spectra, block, self.parts[:, tried])
+        turns = 2 * np.pi * np.fft.fftfreq(len(spectra))
+        near = np.flatnonzero(np.abs(turns) <= 2 * np.pi * LONGEST * BLOCK)
+        weight = 4 * self.averages / power[tried]
+        found = np.abs(np.fft.fft(spectra, axis=0)[near]) ** 2 * weight
+        lag, best = np.unravel_index(np.argmax(found), found.shape)
+        fine = turns[near[lag]] + turns[1] * np.linspace(-1, 1, 17)
+        sums = np.exp(-1j * fine[:, None] * self.block) @ self.parts[:, tried[best]]
+        top = int(np.argmax(np.abs(sums)))
+        times = 1 + 0.72 * _Z * 2 * LONGEST * self.n_frequencies
+        limit = 2 * math.log(len(tried) * times / level)
+        if np.abs(sums[top]) ** 2 * weight[best] < limit:
+            return None
+        turn = fine[top] / BLOCK
+        phase = np.angle(sums[top]) - turn * (BLOCK - 1) / 2  # that of the middle of a block
+        return int(tried[best]), float(phase), float(turn), limit
 
     def explained(self, chosen: IntArray, amounts: FloatArray) -> float:
         """Return the decrease of the band's likelihood ratio statistic by given amounts."""
@@ -185,10 +252,8 @@ def pair_scores(
         return None
     pairs = np.array(list(combinations(range(p), 2)), dtype=np.int64).reshape(-1, 2)
     i, j = pairs.T
-    projector = maximum.take(rows).projector
-    score = 2 * (maximum.rest[rows] - projector).real.sum(axis=0)[i, j]
     n_bins = max(FEWEST, ELEMENTS // (p * len(pairs)))
-    projector = projector[:: -(-len(rows) // n_bins)]
+    projector = maximum.take(rows[:: -(-len(rows) // n_bins)]).projector
     left = fisher.covariance(np.abs(projector) ** 2)
     known = np.isfinite(left).all(axis=(1, 2)) & np.isfinite(projector).all(axis=(1, 2))
     left, projector = left[known], projector[known]
@@ -196,13 +261,19 @@ def pair_scores(
     spread = 1 + 2 * float(
         sum(r * max(0.0, 1 - lag / len(rows)) for lag, r in enumerate(neighbours, start=1))
     )
+    block, first = np.unique(rows // BLOCK, return_index=True)
+    parts = np.add.reduceat(maximum.take(rows).residual[:, i, j], first)
+    power, across = share * _powers(projector, left, i, j)
     return Scores(
         pairs,
-        score,
-        share * _power(projector, left, i, j),
+        2 * parts.real.sum(axis=0),
+        power,
         lambda some: share * _information(projector, left, pairs, some),
         (n_effective - q) / spread,
         len(rows),
+        parts,
+        block,
+        across,
     )
 
 
@@ -243,12 +314,17 @@ def shift(
     return np.asarray((inverse[:, a == b] @ seen[:, :, None])[:, :, 0].real)
 
 
-def _power(projector: ComplexArray, left: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
-    """Return the diagonal of `_information`."""
-    with_noise = 2 * (projector[:, :, i].conj() * projector[:, :, j]).real
-    lost = (with_noise * (left @ with_noise)).sum(axis=(0, 1))
-    own = projector[:, j, i] ** 2 + projector[:, i, i] * projector[:, j, j]
-    return np.asarray(2 * own.real.sum(axis=0) - lost)
+def _powers(projector: ComplexArray, left: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
+    """Return the diagonal of `_information`, and that for noise a quarter of a turn apart."""
+    with_noise = 2 * projector[:, :, i].conj() * projector[:, :, j]
+    apart = (projector[:, i, i] * projector[:, j, j]).real
+    turning = (projector[:, j, i] ** 2).real
+    return np.array(
+        [
+            (2 * (apart + sign * turning)).sum(axis=0) - (w * (left @ w)).sum(axis=(0, 1))
+            for sign, w in ((1, with_noise.real), (-1, with_noise.imag))
+        ]
+    )
 
 
 def _information(
