@@ -257,6 +257,11 @@ def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:
     if snapshot.nonlinear:
         above = UNCERTAIN * explained
         yield contribution(Source.LINEARITY, psd.shape, below=below, above=above)
+    if snapshot.dependent:
+        most = np.zeros(psd.shape)
+        for one in snapshot.dependent:
+            most[:, one.column] = np.maximum(most[:, one.column], one.most)
+        yield contribution(Source.OF_MOTION, psd.shape, below=most)
 
 
 def _sensitivities(snapshot: Snapshot, method: str, shape: tuple[int, int]) -> list[Contribution]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from daq.estimation.noise_estimates import Channels, responses
 from daq.estimation.segments.segment_pass import Pass
-from daq.estimation.snapshot import NonlinearChannel
+from daq.estimation.snapshot import DependentChannel, NonlinearChannel
 from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
 from estimator.levels.interval import unpredicted
 from estimator.self_noise.result import Flag, SelfNoise
@@ -25,8 +25,10 @@ def nonlinear_channels(
     frequency: FloatArray,
     channels: Channels,
     unit: str,
-) -> tuple[NonlinearChannel, ...]:
-    """Return the channels that are not linear, the one with the largest evidence first.
+) -> tuple[tuple[NonlinearChannel, ...], tuple[DependentChannel, ...]]:
+    """Return the channels that are not linear, and those whose noise depends on their motion.
+
+    The one with the largest evidence first.
 
     Parameters
     ----------
@@ -42,12 +44,12 @@ def nonlinear_channels(
     tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
     dims = passes[0].aligned.dims
     if not len(tested.bins) or len(dims) < 2:
-        return ()
+        return (), ()
     for band in raw if passes[0].octaves is None else ():
         csm, averages = band.csm[tested.bins], np.full(len(tested.bins), band.n_effective)
         left = unpredicted(csm, dims=dims, n_effective=averages)[0].sum(axis=0)
         if (np.einsum("fii->i", csm).real < _SHOWN * left).all():
-            return ()
+            return (), ()
     total = sum(each.n_seen for each in passes)
     for each in passes:
         n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
@@ -57,14 +59,30 @@ def nonlinear_channels(
             tested.add(samples)
     sensor = np.repeat(np.arange(len(dims)), dims)
     response = np.abs(responses(frequency, channels, unit)) ** 2
-    found = []
-    for one in tested.nonlinear(sensor):
-        psd = np.interp(frequency, tested.frequency, one.explained)
+
+    def in_unit(column: int, frequencies: FloatArray, psd: FloatArray) -> FloatArray:
         with np.errstate(divide="ignore", invalid="ignore"):
-            psd = psd / response[:, one.channel]
-        psd = np.where(np.isfinite(psd), psd, 0.0)
-        found.append(NonlinearChannel(one.channel, one.evidence, psd))
-    return tuple(found)
+            psd = np.interp(frequency, frequencies, psd) / response[:, column]
+        return np.where(np.isfinite(psd), psd, 0.0)
+
+    nonlinear = [
+        NonlinearChannel(
+            each.channel, each.evidence, in_unit(each.channel, tested.frequency, each.explained)
+        )
+        for each in tested.nonlinear(sensor)
+    ]
+    dependent = [
+        DependentChannel(
+            column=each.channel,
+            band=each.band,
+            form=each.form,
+            evidence=each.evidence,
+            size=each.size,
+            most=in_unit(each.channel, welch.frequencies, each.explained),
+        )
+        for each in tested.dependences(sensor)
+    ]
+    return tuple(nonlinear), tuple(dependent)
 
 
 def linearised(

@@ -21,6 +21,7 @@ from daq.protocols.block import Event
 from daq.recording.interface import ReadableSensor
 from daq.recording.sensor_state import STATE_AFTER
 from estimator.checks.advice import Names
+from estimator.checks.instants import Form
 from estimator.errors import InsufficientDataError
 from estimator.records import Hertz, Seconds, Share, dataclass
 from estimator.self_noise.result import SelfNoise
@@ -222,6 +223,32 @@ class NonlinearChannel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DependentChannel:
+    """A channel whose noise depends on its motion at the same instant.
+
+    Attributes
+    ----------
+    column : int
+    band : tuple of (float, float)
+        Hz.
+    form : Form
+    evidence : float
+        That it does, in standard deviations.
+    size : float
+        Standard deviation of the instants in seconds, or of the gain; 0 of other forms.
+    most : float64, shape (n_freqs,)
+        By how much its noise PSD may be too high for that, in unit**2/Hz.
+    """
+
+    column: int
+    band: tuple[float, float]
+    form: Form
+    evidence: float
+    size: float
+    most: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
     """The estimate at one moment, with everything a front end shows.
 
@@ -267,6 +294,9 @@ class Snapshot:
         What channels of several sensors share of it. Of a finished estimate.
     nonlinear : tuple of NonlinearChannel
         Channels that are not linear, the one with the largest evidence first. Of a finished
+        estimate.
+    dependent : tuple of DependentChannel
+        Channels whose noise depends on their motion otherwise, the clearest first. Of a finished
         estimate.
     linearised : bool
         Whether what is not linear is taken off their noise.
@@ -327,6 +357,7 @@ class Snapshot:
     quantisation_psd: FloatArray | None = None
     rounded_alike: SharedRounding | None = None
     nonlinear: tuple[NonlinearChannel, ...] = ()
+    dependent: tuple[DependentChannel, ...] = ()
     linearised: bool = False
     bridged: Bridged | None = None
     left_open: tuple[str, ...] = ()

@@ -288,8 +288,8 @@ class SnapshotBuilder:
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
         counting = _counting_rates(latest) if final else {}
-        nonlinear = (
-            nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ()
+        nonlinear, dependent = (
+            nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ((), ())
         )
         psd = np.diagonal(csm, axis1=1, axis2=2).real
         if final or (self._diagnoses.is_due and not left):
@@ -355,6 +355,7 @@ class SnapshotBuilder:
             diagnostics=replace(diagnostics, beside=estimates.beside),
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             nonlinear=nonlinear,
+            dependent=dependent,
             linearised=self._settings.linearise and bool(nonlinear),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,

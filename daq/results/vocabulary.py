@@ -113,6 +113,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.GAINS: "gains or noise that may follow the loudness",
     Source.STEADY_MOTION: "motion that does not tell noise from motion",
     Source.LINEARITY: "squares and cubes of the motion",
+    Source.OF_MOTION: "noise that depends on the motion",
     Source.COUNTS: "rounding that channels share",
     Source.GUSTS: "noise in gusts",
     Source.FAULTY: "a faulty channel",

@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.checks.instants import Dependence, dependences, without
 from estimator.levels.pooled import blocks_of
 from estimator.records import dataclass
 from estimator.spectra.welch import WelchSettings
@@ -28,6 +29,8 @@ from estimator.types import ComplexArray, FloatArray, IntArray
 MOST_SEGMENTS = 48
 MOST_BINS = 200
 MOST_PREDICTORS = 12
+MOST_VALUES = 2_000_000
+"""Values of the segments' spectra that are kept at all frequencies."""
 LEAST_LEFT = 12
 """Segments beyond the predictors without which nothing is tested."""
 PEAK = 6.0
@@ -84,6 +87,8 @@ class SquaresAndCubes:
         self._density = 2 / (welch.sampling_rate * float(self._window @ self._window))
         self._scale: FloatArray | None = None
         self._spectra: list[NDArray[np.complex64]] = []
+        self._whole: list[NDArray[np.complex64]] = []
+        self._frequencies, self._highest = welch.frequencies, float(self.frequency.max(initial=0))
 
     def add(self, samples: FloatArray) -> None:
         """Add a segment, (segment_length, n_channels), unless it is disturbed."""
@@ -98,8 +103,10 @@ class SquaresAndCubes:
         power = (square @ self._window**2) / (self._window @ self._window)
         terms = np.stack([x, square, x * (square - 3 * power[:, None])])
         terms *= self._window
-        spectra = np.fft.rfft(terms)[:, :, self.bins]
-        self._spectra.append(spectra.astype(np.complex64).transpose(2, 1, 0))
+        spectra = np.fft.rfft(terms).astype(np.complex64)
+        self._spectra.append(spectra[:, :, self.bins].transpose(2, 1, 0))
+        if len(self._whole) * spectra[0].size < MOST_VALUES:
+            self._whole.append(spectra[0])
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
@@ -132,6 +139,24 @@ class SquaresAndCubes:
             found.append(replace(best, explained=scale * best.explained))
         return found
 
+    def dependences(self, sensor: IntArray) -> list[Dependence]:
+        """Return where noise depends on the motion otherwise, the clearest first.
+
+        `explained` has the channel's unit**2/Hz, at all frequencies of the transform.
+        """
+        if self._scale is None or len(self._whole) < LEAST_LEFT:
+            return []
+        found = dependences(
+            np.stack(self._whole),
+            self._frequencies,
+            self._window,
+            sensor,
+            highest=self._highest,
+            most_predictors=MOST_PREDICTORS,
+        )
+        scale = self._density * self._scale**2
+        return [replace(each, explained=scale[each.channel] * each.explained) for each in found]
+
 
 def _worst(
     spectra: NDArray[np.complex64], sensor: IntArray, one: int, block: IntArray, known: list[int]
@@ -147,7 +172,7 @@ def _worst(
         [spectra[:, :, others, 0], *(spectra[:, :, c, 1:] for c in further)], axis=2
     ).transpose(1, 0, 2)
     wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
-    rest = _without(predictors.astype(np.complex128), wanted.astype(np.complex128))
+    rest = without(predictors.astype(np.complex128), wanted.astype(np.complex128))
     rest = rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS)
     evidence, explained = _explained(rest, block, left)
     of_squares = explained.sum(axis=0)
@@ -159,12 +184,6 @@ def _worst(
         if power[n] > LOUD * unexplained[n] and evidence[n] > CERTAIN
     ]
     return max(found, key=lambda each: each.share, default=None)
-
-
-def _without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
-    """Return what predictors leave of spectra, both (n_freqs, n_segments, n)."""
-    basis, _ = np.linalg.qr(predictors)
-    return np.asarray(wanted - basis @ (basis.conj().swapaxes(1, 2) @ wanted))
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:

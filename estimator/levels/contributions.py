@@ -55,6 +55,8 @@ class Source(enum.StrEnum):
     """Parts of the recording between which the motion changes contradict the method."""
     LINEARITY = "linearity"
     """The channel is not linear: squares and cubes of the motion add to its noise."""
+    OF_MOTION = "of-motion"
+    """The noise of the channel depends on its motion at the same instant."""
     COUNTS = "counts"
     """Like channels are rounded to counts alike, and share a part of that."""
     CHANGES = "changes"

@@ -373,6 +373,47 @@ def _drifts(scene: Scene) -> None:
     _delayed(scene, 5e-6 * scene.time)
 
 
+def _sways(scene: Scene) -> None:
+    _delayed(scene, 3e-5 * np.sin(2 * np.pi * scene.time / 20))
+
+
+def _jitters(scene: Scene) -> None:
+    _delayed(scene, 2e-5 * scene.rng.standard_normal(N_SAMPLES))
+
+
+def _has_play(scene: Scene) -> None:
+    x = scene.felt[BROKEN, :, 0]
+    width, at, found = 0.005 * x.std(), x[0], []
+    for value in x.tolist():
+        at = min(max(at, value - width), value + width)
+        found.append(at)
+    scene.felt[BROKEN, :, 0] = found
+
+
+def _slow(scene: Scene) -> None:
+    x = scene.felt[BROKEN, :, 0]
+    most, at, found = 2.8 * np.diff(x).std(), x[0], []
+    for value in x.tolist():
+        at += min(max(value - at, -most), most)
+        found.append(at)
+    scene.felt[BROKEN, :, 0] = found
+
+
+def _converter(scene: Scene) -> None:
+    x = scene.felt[BROKEN, :, 0]
+    scene.felt[BROKEN, :, 0] += 2e-3 * x.std() * np.sin(4 * np.pi * x / x.std())
+
+
+def _fills_gaps(scene: Scene) -> None:
+    """Fill 200 gaps of 5 samples by straight lines: before noise, which they lack, too."""
+    both = scene.felt[BROKEN] + scene.noise[BROKEN]
+    within = np.linspace(0, 1, 7)[1:-1, None]
+    for at in scene.rng.integers(10, N_SAMPLES - 10, 200):
+        before, after = both[[at - 1, at + 5]]
+        both[at : at + 5] = before + within * (after - before)
+    scene.felt[BROKEN] = both - scene.noise[BROKEN]
+
+
 def _jumps(scene: Scene) -> None:
     scene.felt[BROKEN, N_SAMPLES // 2 :] = np.roll(scene.felt[BROKEN], 1, axis=0)[N_SAMPLES // 2 :]
 
@@ -431,6 +472,7 @@ class Kind:
 STEADY = ("ResponseChanges",)
 NOISE = ("NoiseChanges",)
 LINEAR = ("NotLinear",)
+AT_INSTANTS = ("NoiseDependsOnMotion", *LINEAR)
 SHARED = ("SharedNoise", "SharedByTwo")
 KINDS: Mapping[str, Kind] = {
     "nothing": Kind(_nothing),
@@ -514,6 +556,14 @@ KINDS: Mapping[str, Kind] = {
     "a resonance moves from 8 to 8.2 Hz": Kind(_filter_moves(_peak(8), _peak(8.2)), STEADY),
     "gain of an octave rises by 2 % at once": Kind(_octave_gains, STEADY),
     "gain of a sensor jitters by 2 % in 4 s": Kind(_course(_jitter), STEADY),
+    "instants of a sensor sway by 30 µs in 20 s": Kind(_sways, AT_INSTANTS),
+    "instants of a sensor jitter by 20 µs": Kind(_jitters, AT_INSTANTS),
+    "a channel has play of 0.005 rms": Kind(_has_play, AT_INSTANTS),
+    "a channel is slower than 2.8 rms of its slope": Kind(_slow, (*AT_INSTANTS, *STEADY)),
+    "a converter has steps of 2e-3 rms": Kind(_converter, AT_INSTANTS),
+    "200 gaps of 50 ms are filled by lines": Kind(
+        _fills_gaps, (*AT_INSTANTS, *STEADY, "DisturbedSegments", "ChannelsStoodStill")
+    ),
 }
 PAIRS = (
     ("gain of a sensor rises by 3 %", "a channel has a square of 2e-3 of its rms"),

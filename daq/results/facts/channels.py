@@ -12,6 +12,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank
+from estimator.checks.instants import Form
 from estimator.checks.sensitivities import CAUSES, TOLERANCE, likely_cause, wrong_gains
 from estimator.levels.bands import third_octaves
 from estimator.records import Hertz, Seconds, Share
@@ -253,6 +254,48 @@ class NotLinear(Fact):
         )
 
 
+class NoiseDependsOnMotion(Fact):
+    """The noise of channels of a sensor depends on their motion at the same instant.
+
+    Attributes
+    ----------
+    form : Form
+    evidence : float
+        That it does, in standard deviations.
+    instants : float or None
+        Standard deviation of the instants of samples that would do so, in seconds.
+    gain : float or None
+        That of the gain, as a fraction.
+    """
+
+    form: Form
+    evidence: float
+    instants: Seconds | None = None
+    gain: Share | None = None
+
+    def _words(self) -> Words:
+        who, (own,) = few(self.channels), self.sensors
+        do = f"check {own}"
+        if self.form == "instants":
+            what = f"Sampling instants of {own} vary by about {1e6 * (self.instants or 0):.2g} µs"
+            do = "check how its samples are timed"
+        elif self.form == "gain":
+            what = f"The gain of {who} varies by about {percent(self.gain or 0)} at every moment"
+        elif self.form == "filled":
+            what = f"Noise of {who} is larger where its motion is smaller"
+            do = "are samples filled in?"
+        else:
+            what = f"{who} bends, by neither squares nor cubes"
+        return Words(
+            f"{what}; {do}",
+            f"{what}. Noise of {listed(self.channels)} depends on the motion at the same instant "
+            f"({self.evidence:.0f} standard deviations), and may be lower without it. The "
+            "intervals include it.",
+            "Check the sensor, its range, and how its samples are timed or filled in; or record "
+            "with less motion.",
+        )
+
+
 def facts_of_channels(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield channels whose samples are wrong."""
     names = [label.name for label in snapshot.channels]
@@ -351,10 +394,10 @@ def facts_of_rounding(snapshot: Snapshot) -> Iterator[RoundedAlike]:
         )
 
 
-def facts_of_linearity(snapshot: Snapshot) -> Iterator[NotLinear]:
+def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
     """Yield the sensors that are not linear, the one with the largest evidence first."""
     edges = third_octaves(snapshot.frequency, *known_range(snapshot))
-    if not snapshot.nonlinear or not snapshot.results or len(edges) < 2:
+    if not snapshot.results or len(edges) < 2:
         return
     noise = next(iter(snapshot.results.values())).noise_psd
     shares: dict[str, dict[str, float]] = {}
@@ -368,13 +411,31 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[NotLinear]:
         label = snapshot.channels[each.column]
         shares.setdefault(label.sensor, {})[label.name] = share
         evidence.setdefault(label.sensor, each.evidence)
+    much = {name for name, found in shares.items() if max(found.values()) > MUCH_NONLINEAR}
     for sensor, of_channel in shares.items():
-        much = max(of_channel.values()) > MUCH_NONLINEAR and not snapshot.linearised
+        is_much = sensor in much and not snapshot.linearised
         yield NotLinear(
-            rank=Rank.DELAYS if much else Rank.TO_KNOW,
+            rank=Rank.DELAYS if is_much else Rank.TO_KNOW,
             sensors=(sensor,),
             channels=tuple(of_channel),
             shares=tuple(of_channel.values()),
             evidence=evidence[sensor],
             is_subtracted=snapshot.linearised,
+        )
+    for sensor in dict.fromkeys(snapshot.channels[e.column].sensor for e in snapshot.dependent):
+        of_sensor = [e for e in snapshot.dependent if snapshot.channels[e.column].sensor == sensor]
+        first, *_ = of_sensor
+        if sensor in much:
+            continue
+        yield NoiseDependsOnMotion(
+            rank=Rank.DELAYS,
+            sensors=(sensor,),
+            channels=tuple(
+                snapshot.channels[column].name for column in sorted({e.column for e in of_sensor})
+            ),
+            band=(min(e.band[0] for e in of_sensor), max(e.band[1] for e in of_sensor)),
+            form=first.form,
+            evidence=first.evidence,
+            instants=first.size if first.form == "instants" else None,
+            gain=first.size if first.form == "gain" else None,
         )

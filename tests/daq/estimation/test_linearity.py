@@ -10,7 +10,7 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
-from daq.results.facts.channels import NotLinear
+from daq.results.facts.channels import NoiseDependsOnMotion, NotLinear
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_noise import ResponseChanges
@@ -51,6 +51,36 @@ def test_a_square_is_in_the_interval_or_subtracted(linearise: bool, scale: float
     assert np.abs(error).max() < 2.5 if linearise else error.min() > 6
 
 
+def test_instants_that_sway_are_in_the_interval() -> None:
+    """Their noise is ``(2 pi f tau)**2`` of the motion: four times that of the sensor at 20 Hz."""
+    rng = np.random.default_rng(46)
+    time, tau = np.arange(N_SAMPLES) / RATE, 1.6e-5
+    motion = 1e3 * rng.standard_normal((N_SAMPLES, 3))
+    spectrum = np.fft.rfft(motion, axis=0)
+    slope = np.fft.irfft(
+        spectrum * 2j * np.pi * np.fft.rfftfreq(N_SAMPLES, 1 / RATE)[:, None], axis=0
+    )
+    arrays = {
+        name: each @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + rng.standard_normal(each.shape)
+        for name, each in {
+            "A": motion,
+            "B": motion + np.sqrt(2) * tau * np.sin(1.7 * time)[:, None] * slope,
+            "C": motion,
+        }.items()
+    }
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings(segment=5.0))
+    result = Result(snapshot, Settings(segment=5.0))
+    (fact,) = (each for each in result.facts if isinstance(each, NoiseDependsOnMotion))
+    assert fact.sensors == ("B",)
+    assert fact.instants == pytest.approx(tau, rel=0.4)
+    found = result.spectrum(result.method).levels(np.searchsorted(snapshot.frequency, EDGES))
+    low, high = found.ends()
+    truth = 2 / RATE
+    assert found.mean[2, 3:6].min() > 3 * truth
+    assert ((low < truth) & (truth < high))[:, 3:6].all()
+    assert np.isfinite(low[:, :3]).all()
+
+
 def test_a_linear_bench_has_no_such_fact_and_the_same_numbers() -> None:
     rng = np.random.default_rng(48)
     motion = 1e3 * rng.standard_normal((N_SAMPLES, 1))
@@ -58,6 +88,7 @@ def test_a_linear_bench_has_no_such_fact_and_the_same_numbers() -> None:
     recording = recording_of_arrays(arrays, sampling_rate=RATE)
     one, other = (estimate([recording], Settings(linearise=each)) for each in (False, True))
     assert not one.nonlinear
+    assert not one.dependent
     for name, noise in one.results.items():
         np.testing.assert_array_equal(noise.noise_psd, other.results[name].noise_psd)
 

@@ -1,0 +1,289 @@
+"""Whether what others do not predict of a channel depends on its motion at the same instant.
+
+Own noise knows nothing of the motion. What a hysteresis, the steps of a converter or a limited
+speed leave has a mean that is a curve of the motion, or of its slope. What instants of samples
+that vary leave is ``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast
+or seldom: their mean is 0, but their square follows that of the slope or of the motion, instant by
+instant, where averages of segments show noise.
+
+Residuals are those of spectra of segments, with unit power at all frequencies of two octaves. Both
+tests compare segments with each other, so that no distribution of the noise is assumed. Evidence
+is in standard deviations of a normal variable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.records import dataclass
+from estimator.types import ComplexArray, FloatArray, IntArray
+
+Samples: TypeAlias = NDArray[np.floating[Any]]
+Form: TypeAlias = Literal["curve", "gain", "instants", "filled"]
+"""Of what depends on the motion; "filled": what is there where motion, or its slope, is small."""
+WIDTH = 4.0
+"""Highest over lowest frequency of a band."""
+LEAST_BINS = 16
+"""Frequencies of a band."""
+NOT_WEAK, LOUD = 4.0, 50.0
+"""Power of a channel over what others do not predict, from which it is compared, and named."""
+VERY_LOUD = 1000.0
+"""The same for curves: what is predicted has noise of others, and bends beside weak motion."""
+CERTAIN = 5.0
+"""Evidence from which a channel depends on its motion."""
+PART = 0.4
+"""Power that depends on the motion, over the most of any channel, from which a channel is named:
+a third sensor has a quarter of it in what others leave of it."""
+TOGETHER = 0.92
+"""Evidence of all channels of a sensor, over what it were of independent ones."""
+PIECE = 24
+"""Samples of a piece, of 2.5 for each wave of the highest frequency of a band."""
+WITHIN_BAND = 4.0
+"""Power at a frequency that depends on the motion, over that in a band, at most."""
+_LEAST = float(np.finfo(np.float32).tiny)
+_CELLS = 48  # of a curve, an eighth of a standard deviation wide
+
+
+@dataclass(frozen=True, slots=True)
+class Dependence:
+    """A channel whose noise depends on its motion, in a band.
+
+    Attributes
+    ----------
+    channel : int
+    band : tuple of (float, float)
+        Hz.
+    form : Form
+    evidence : float
+    size : float
+        Standard deviation of the instants in seconds, or of the gain; 0 of other forms.
+    explained : float64, shape (n_freqs,)
+        Power spectrum that may depend on the motion, in this band or another: four times what
+        these gains or instants leave, or what other sensors do not predict.
+    power : float
+        Power that depends on the motion over that of the channel.
+    is_loud : bool
+        Whether the motion is loud enough to tell.
+    """
+
+    channel: int
+    band: tuple[float, float]
+    form: Form
+    evidence: float
+    size: float
+    explained: FloatArray
+    power: float
+    is_loud: bool
+
+
+def dependences(
+    spectra: NDArray[np.complexfloating],
+    frequency: FloatArray,
+    window: FloatArray,
+    sensor: IntArray,
+    *,
+    highest: float,
+    most_predictors: int,
+) -> list[Dependence]:
+    """Return where channels depend on their motion, the clearest first.
+
+    Parameters
+    ----------
+    spectra : complex, shape (n_segments, n_channels, n_freqs)
+        Of segments times `window`, at all frequencies of the transform.
+    frequency : float64, shape (n_freqs,)
+        Hz.
+    window : float64, shape (segment_length,)
+    sensor : int64, shape (n_channels,)
+        Sensor of each channel.
+    highest : float
+        Frequency in Hz up to which spectra are known.
+    most_predictors : int
+    """
+    found: list[Dependence] = []
+    for each in range(int(sensor.max()) + 1):
+        own = np.flatnonzero(sensor == each)
+        others = np.flatnonzero(sensor != each)[:most_predictors]
+        if len(others) > len(spectra) // 2:
+            continue
+        wanted, known = (spectra[:, some].transpose(2, 0, 1) for some in (own, others))
+        left = without(known.astype(np.complex128), wanted.astype(np.complex128))
+        motion, rest = (x.transpose(2, 1, 0).astype(np.complex64) for x in (wanted, left))
+        of_sensor = _Sensor(motion, rest, frequency, window)
+        for number, band in enumerate(_bands(frequency, highest)):
+            clear = of_sensor.clearest(band, is_highest=number == 0)
+            found += [replace(one, channel=int(own[one.channel])) for one in clear]
+    most = {each.band: 0.0 for each in found}
+    for one in found:
+        most[one.band] = max(most[one.band], one.power)
+    found = [each for each in found if each.is_loud and each.power > PART * most[each.band]]
+    return sorted(found, key=lambda each: -each.evidence)
+
+
+def without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
+    """Return what predictors leave of spectra, both (n_freqs, n_segments, n)."""
+    basis, _ = np.linalg.qr(predictors)
+    return np.asarray(wanted - basis @ (basis.conj().swapaxes(1, 2) @ wanted))
+
+
+def _bands(frequency: FloatArray, highest: float) -> Iterator[slice]:
+    """Yield the frequencies of the bands, the highest first."""
+    high = int(np.searchsorted(frequency, highest))
+    while high > LEAST_BINS:
+        low = max(2, int(high / WIDTH))
+        if high - low >= LEAST_BINS:
+            yield slice(low, high)
+        high = low
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sensor:
+    """Spectra of the channels of a sensor, and what others do not predict of them.
+
+    Attributes
+    ----------
+    motion, rest : complex64, shape (n_channels, n_segments, n_freqs)
+    frequency : float64, shape (n_freqs,)
+    window : float64, shape (segment_length,)
+    """
+
+    motion: NDArray[np.complex64]
+    rest: NDArray[np.complex64]
+    frequency: FloatArray
+    window: FloatArray
+
+    def clearest(self, own: slice, *, is_highest: bool) -> Iterator[Dependence]:
+        """Yield what is clearest in a band of each channel, if it is clear.
+
+        Curves are looked for in the highest band.
+        """
+        felt, left = (np.mean(np.abs(e) ** 2, axis=1) for e in (self.motion, self.rest))
+        there = left[:, own].sum(axis=1) / np.maximum(felt[:, own].sum(axis=1), _LEAST)
+        tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (there < 1 / NOT_WEAK))
+        if not len(tested):
+            return
+        motion, rest = self.motion[tested], self.rest[tested, :, own]
+        rest = rest / np.sqrt(left[tested, None, own])
+        n = 2 * (int(1.25 * own.stop) + 1)
+        middle = slice(n // 4, n - n // 4)
+        at = np.arange(n)[middle] * (len(self.window) / n)
+        w = np.interp(at, np.arange(len(self.window)), self.window).astype(np.float32)
+
+        def course(spectrum: NDArray[np.complex64], first: int) -> Samples:
+            padded = np.zeros((*spectrum.shape[:2], first + spectrum.shape[2]), np.complex64)
+            padded[..., first:] = spectrum
+            return np.asarray(np.fft.irfft(padded, n)[..., middle] / w)
+
+        turn = (2j * np.pi * self.frequency).astype(np.complex64)
+        x, r = course(motion[:, :, own], own.start), course(rest, own.start)
+        slope = course(turn[own] * motion[:, :, own], own.start)
+        r = _left(r, *(np.gradient(w) / w * each for each in (x, slope)))
+        squares = x**2, slope**2
+        # noise is in the motion, too, and has something in common with that of one segment
+        size = np.einsum("cst,cst->cs", x, x)
+        along = np.einsum("cst,cst->cs", r, x) / np.maximum(size, _LEAST)
+        r = r - along[..., None] * x
+        (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
+        curve = of_curve = np.zeros(len(tested))
+        if is_highest:
+            curve, of_curve = _curve(r, course(motion[:, :, 1:], 1))
+            curve = np.where(there[tested] < 1 / VERY_LOUD, curve, 0.0)
+        # all channels of a sensor are sampled at one instant; their residuals are not independent
+        instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
+        forms: tuple[Form, ...] = ("gain", "instants", "curve")
+        evidence = np.stack([np.abs(gain), np.abs(instants), curve])
+        shares = np.stack([of_gain, of_instants, of_curve])
+        band = float(self.frequency[own.start]), float(self.frequency[own.stop - 1])
+        for place, best in enumerate(evidence.argmax(axis=0).tolist()):
+            channel, share, form, size = int(tested[place]), shares[best, place], forms[best], 0.0
+            # what predictors explain by chance lacks where motion is large, in long waves
+            if evidence[best, place] < CERTAIN or (share < 0 and not is_highest):
+                continue
+            most = WITHIN_BAND * left[channel]
+            if share < 0:
+                form = "filled"
+            elif form != "curve":
+                scale = np.mean(squares[0][place]) / np.mean(squares[best][place])
+                size = float(np.sqrt(share * there[channel] * scale))
+            share = min(abs(share), 1.0)
+            if size and WITHIN_BAND * share < 1:
+                alike = felt[channel] * size**2 * (1.0 if form == "gain" else np.abs(turn) ** 2)
+                alike = np.maximum(share * left[channel, own].mean(), alike)
+                most = np.minimum(WITHIN_BAND * alike, most)
+            yield Dependence(
+                channel=channel,
+                band=band,
+                form=form,
+                evidence=float(evidence[best, place]),
+                size=size,
+                explained=most.astype(np.float64),
+                power=float(share * there[channel]),
+                is_loud=bool(there[channel] < 1 / LOUD),
+            )
+
+
+def _left(r: Samples, *edges: Samples) -> Samples:
+    """Return residuals without what the edges of windows let through of linear responses."""
+    gram = np.einsum("acst,bcst->cab", edges, edges)
+    along = np.einsum("acst,cst->ca", edges, r)
+    much = (np.linalg.pinv(gram, hermitian=True) @ along[..., None])[..., 0]
+    return np.asarray(r - np.einsum("acst,ca->cst", edges, much))
+
+
+def _of_square(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise whose power follows a square, shape (n_channels,).
+
+    Both of shape (n_channels, n_segments, n_samples). Means of short pieces are taken off: loudness
+    that noise and motion have in common is none that follows the motion at every instant.
+    """
+    n, n_pieces = r.shape[1], r.shape[2] // PIECE
+    shape = (-1, n, n_pieces, PIECE)
+    power, square = (e[..., : n_pieces * PIECE].reshape(shape) for e in (r**2, square))
+    of_noise, of_motion = (
+        np.maximum(each.mean(axis=(2, 3), dtype=np.float64), _LEAST) for each in (power, square)
+    )
+    power, square = (each - each.mean(axis=3, keepdims=True) for each in (power, square))
+    number = PIECE * n_pieces
+    along = np.einsum("cspt,cspt->cs", power, square) / number / (of_noise * of_motion)
+    spread = np.einsum("cspt,cspt->cs", square, square) / number / of_motion**2
+    mean = along.mean(axis=1)
+    t = mean / np.maximum(along.std(axis=1, ddof=1), _LEAST) * np.sqrt(n)
+    normal = np.sqrt((n - 1) * np.log1p(t**2 / (n - 1))) * (8 * n - 7) / (8 * n - 5)  # Wallace
+    return np.copysign(normal, t), mean / np.maximum(spread.mean(axis=1), _LEAST)
+
+
+def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise with a mean that is a curve of x, shape (n_channels,).
+
+    A straight line is none. Where signs of segments are as likely plus as minus, the sum over cells
+    has the mean and the variance below, and close to a chi-squared distribution.
+    """
+    shape = n_channels, n, _ = r.shape
+    x = x / np.sqrt(np.maximum(np.mean(x**2, axis=(1, 2), keepdims=True), _LEAST))
+    cell = np.clip(8 * x + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
+    cell += _CELLS * np.arange(n_channels * n).reshape(*shape[:2], 1)
+    sizes = n_channels, n, _CELLS
+    count, line, sums = (
+        np.bincount(cell.ravel(), weights, n_channels * n * _CELLS).reshape(sizes)
+        for weights in (None, x.ravel(), r.ravel())
+    )
+    size = np.sqrt(count.sum(axis=1))
+    used = size**2 > n
+    scale = np.where(used, 1 / np.where(used, size, 1.0), 0.0)
+    basis, _ = np.linalg.qr(np.stack([size * used, line.sum(axis=1) * scale], axis=2))
+    sums = sums * scale[:, None]
+    sums -= (sums @ basis) @ basis.swapaxes(1, 2)
+    gram = sums @ sums.swapaxes(1, 2)
+    own = np.einsum("css->cs", gram)
+    total, expected = gram.sum(axis=(1, 2)), own.sum(axis=1)
+    variance = 2 * (np.sum(gram**2, axis=(1, 2)) - np.sum(own**2, axis=1))
+    spread = variance / (9 * expected**2)  # of the cube root (Wilson and Hilferty)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        evidence = (np.cbrt(total / expected) - (1 - spread)) / np.sqrt(spread)
+    share = np.maximum(total - expected, 0.0) / np.sum(r**2, axis=(1, 2))
+    return np.where(variance > 0, evidence, 0.0), share

@@ -1,0 +1,121 @@
+"""Noise that depends on the motion is found, by the right name and size, and other noise is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from estimator.checks.instants import Dependence
+from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
+from estimator.spectra.welch import WelchSettings
+
+RATE = 100.0
+WELCH = WelchSettings(RATE, 1000)
+N_SAMPLES = WELCH.segment_length * MOST_SEGMENTS
+TIME = np.arange(N_SAMPLES) / RATE
+
+
+def later(x: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Return what is sampled later, by a course: linear between sixteenths of a sample."""
+    fine = signal.resample_poly(x, 16, 1, axis=0)
+    at = np.clip((np.arange(N_SAMPLES) - seconds * RATE) * 16, 0, len(fine) - 2)
+    place = at.astype(int)
+    part = (at - place)[:, None]
+    return np.asarray((1 - part) * fine[place] + part * fine[place + 1])
+
+
+def with_play(x: np.ndarray, width: float) -> np.ndarray:
+    """Return what follows a course with play."""
+    found, at = np.empty_like(x), x[0]
+    for n, value in enumerate(x.tolist()):
+        at = min(max(at, value - width), value + width)
+        found[n] = at
+    return found
+
+
+def bench(rng: np.random.Generator, ratio: float, n_sensors: int, d: int) -> list[np.ndarray]:
+    motion = 10 ** (ratio / 20) * rng.standard_normal((N_SAMPLES, d))
+    return [motion @ np.linalg.qr(rng.standard_normal((d, d)))[0].T for _ in range(n_sensors)]
+
+
+def dependences(rng: np.random.Generator, sensors: list[np.ndarray]) -> list[Dependence]:
+    samples = np.hstack([each + rng.standard_normal(each.shape) for each in sensors])
+    tested = SquaresAndCubes(WELCH, 47.0)
+    for segment in samples.reshape(MOST_SEGMENTS, WELCH.segment_length, -1):
+        tested.add(segment)
+    return tested.dependences(np.repeat(np.arange(len(sensors)), sensors[0].shape[1]))
+
+
+@pytest.mark.parametrize(("n_sensors", "d"), [(3, 3), (5, 3), (3, 1)])
+@pytest.mark.parametrize("hertz", [0.05, 1.3, 5.0])
+def test_instants_that_sway_have_their_size(n_sensors: int, d: int, hertz: float) -> None:
+    rng = np.random.default_rng([1, n_sensors, d])
+    sensors = bench(rng, 45.0, n_sensors, d)
+    sensors[1] = later(sensors[1], 3e-5 * np.sin(2 * np.pi * hertz * TIME))
+    found = dependences(rng, sensors)
+    assert {each.channel // d for each in found} == {1}
+    assert found[0].form == "instants"
+    assert found[0].size == pytest.approx(3e-5 / np.sqrt(2), rel=0.4)
+
+
+def test_a_gain_that_jitters_within_segments_has_its_size() -> None:
+    rng = np.random.default_rng(2)
+    sensors = bench(rng, 45.0, 3, 3)
+    sensors[2] *= 1 + 0.005 * np.sin(2 * np.pi * 1.3 * TIME)[:, None]
+    found = dependences(rng, sensors)
+    assert {each.channel // 3 for each in found} == {2}
+    assert found[0].form == "gain"
+    assert found[0].size == pytest.approx(0.005 / np.sqrt(2), rel=0.4)
+
+
+@pytest.mark.parametrize("kind", ["play", "steps of a converter"])
+def test_what_bends_otherwise_is_a_curve(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    sensors = bench(rng, 60.0, 3, 3)
+    x = sensors[0][:, 1]
+    sensors[0][:, 1] = with_play(x, 0.005 * x.std())
+    if kind == "steps of a converter":
+        sensors[0][:, 1] = x + 2e-3 * x.std() * np.sin(4 * np.pi * x / x.std())
+    found = dependences(rng, sensors)
+    assert {(each.channel, each.form) for each in found} == {(1, "curve")}
+    assert not found[0].size
+
+
+def test_short_gaps_that_are_filled_are_noise_where_motion_is_slow() -> None:
+    rng = np.random.default_rng(4)
+    sensors = bench(rng, 40.0, 3, 3)
+    within = np.linspace(0, 1, 7)[1:-1, None]
+    for at in rng.integers(10, N_SAMPLES - 10, 107):
+        before, after = sensors[0][[at - 1, at + 5]]
+        sensors[0][at : at + 5] = before + within * (after - before)
+    found = dependences(rng, sensors)
+    assert {(each.channel // 3, each.form) for each in found} == {(0, "filled")}
+
+
+KINDS = ["steady", "gusts", "bursts", "noise in gusts", "heavy tails", "lag", "low pass", "step"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_noise_depends_on_nothing(kind: str) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng([5, seed])
+        sensors = bench(rng, 20 + 10 * seed, 3 + seed % 2, 3)
+        course = np.exp(0.7 * np.interp(TIME, TIME[::200], rng.standard_normal(N_SAMPLES // 200)))
+        if kind in {"gusts", "noise in gusts"}:
+            sensors = [each * course[:, None] for each in sensors]
+        if kind == "noise in gusts":
+            sensors = [each + rng.standard_normal(each.shape) * course[:, None] for each in sensors]
+        if kind == "bursts":
+            for at in rng.integers(0, N_SAMPLES - 2000, 8):
+                for each in sensors:
+                    each[at : at + 1000] *= 20
+        if kind == "heavy tails":
+            sensors = [each + rng.standard_normal(each.shape) ** 3 for each in sensors]
+        if kind == "lag":
+            sensors[0] = np.roll(sensors[0], 1, axis=0)
+        if kind == "low pass":
+            sensors[0] = signal.lfilter(*signal.butter(1, 0.4), sensors[0], axis=0)
+        if kind == "step":
+            sensors[0][N_SAMPLES // 2 :] *= 0.95
+        assert not dependences(rng, sensors)
