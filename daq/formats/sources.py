@@ -305,6 +305,8 @@ class _Index:
         for trace, piece in pieces_of(part, traces, order):
             name = f"{trace.sensor}.{trace.channel}"
             reason = self._selection.reason_against(trace.sensor, trace.channel, fdsn=trace.fdsn)
+            if not (reason or trace.sampling_rate):
+                reason = "no sampling rate"
             if reason:
                 self.left_aside[name] = reason
                 continue

@@ -297,10 +297,14 @@ def show_taken(result: ImportResult, screen: Console) -> None:
         names = [name for name, why in result.left_aside.items() if why == reason]
         screen.print(f"left aside ({reason}): {' '.join(sorted(names))}")
     undated = {each.undated: each.sensor for each in result.sensors if each.undated}
-    if len(undated) > 1:
+    who = ", ".join(undated.values())
+    if undated and not all(each.undated for each in result.sensors):
+        text = "taken to begin in 1970, where the others have no samples; give all files dates"
+        notices().print(f"no date in the files of {who}: {text}", soft_wrap=True)
+    elif len(undated) > 1:
         notices().print(
-            f"no date in the files of {', '.join(undated.values())}: taken to begin at the same"
-            " instant; otherwise give each a column of times with dates",
+            f"no date in the files of {who}: taken to begin at the same instant; otherwise give"
+            " each a column of times with dates",
             soft_wrap=True,
         )
     for problem in result.problems:

@@ -48,17 +48,21 @@ class MiniSeedPart(TracePart):
     def load(self) -> Sequence[Trace]:
         """Return the traces in these records; text, such as a log, is left out."""
         pymseed = load("pymseed", reads="miniSEED is", extra="miniseed")
+        pymseed.clear_error_messages()
         try:
             found = self._listed(pymseed, unpack_data=True)
             traces = [
                 _trace(pymseed, trace.sourceid, segment, self.path, number)
                 for number, trace in enumerate(found, start=1)
                 for segment in trace
-                if segment.sampletype in _NUMERIC and segment.samprate and segment.numsamples
+                if segment.sampletype in _NUMERIC and segment.numsamples
             ]
             n_records = sum(s.recordlist.recordcnt for trace in found for s in trace)
         except (pymseed.MiniSEEDError, ValueError, OverflowError) as error:
             raise self._damaged(str(error)) from error
+        for message in pymseed.get_error_messages():  # samples do not end where they should
+            if "integrity" in message:
+                raise self._damaged(message)
         if n_records < self._n_records:  # libmseed passes over what is no record
             raise self._damaged(f"{n_records} of {self._n_records} records can be read")
         return traces
@@ -146,7 +150,7 @@ def _trace(pymseed: Any, sourceid: str, segment: Any, path: Path, number: int) -
         sensor=sensor,
         channel=channel,
         start_ns=int(segment.starttime),
-        sampling_rate=rate if rate > 0 else -1.0 / rate,
+        sampling_rate=rate if rate >= 0 else -1.0 / rate,
         samples=segment.take_np_datasamples(),
         end_ns=int(segment.endtime),
         fdsn=is_coded,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,30 @@ def test_miniseed_channels_are_absent_where_others_have_samples(tmp_path: Path) 
     found = np.concatenate([stretch.counts[:] for stretch in sensor.stretches])
     x[400:450] = y[:10] = 0
     np.testing.assert_array_equal(found, np.stack([x, y], axis=1))
+
+
+def test_a_miniseed_record_that_does_not_end_as_it_states_is_left_out(tmp_path: Path) -> None:
+    """Steim's differences are damaged, and can be unpacked."""
+    path = write_mseed(tmp_path / "a.mseed", [("00", "HNX", START_NS, counts(3000, 1))])
+    records = bytearray(path.read_bytes())
+    length = 4096
+    begin = struct.unpack_from(">H", records, length + 44)[0]
+    records[length + begin + 11] ^= 0x15  # of the last sample, as the second record states it
+    path.write_bytes(records)
+    found = open_sources([path])
+    assert "Data integrity check for Steim2 failed" in found.problems[0]
+    (sensor,) = found.sensors.values()
+    assert len(sensor.stretches) == 2
+
+
+def test_a_miniseed_channel_without_a_sampling_rate_is_named(tmp_path: Path) -> None:
+    traces = [(code, "HNX", START_NS, counts(400, 1)) for code in ("00", "10")]
+    path = write_mseed(tmp_path / "a.mseed", traces)
+    records = bytearray(path.read_bytes())
+    struct.pack_into(">hh", records, 32, 0, 0)
+    path.write_bytes(records)
+    found = open_sources([path])
+    assert (len(found.sensors), list(found.left_aside.values())) == (1, ["no sampling rate"])
 
 
 def test_miniseed_channels_need_no_samples_in_common(tmp_path: Path) -> None:

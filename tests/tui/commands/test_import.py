@@ -103,6 +103,10 @@ def test_files_without_a_date_are_said_to_begin_together(tmp_path: Path) -> None
     two = [tmp_path / "a.csv", tmp_path / "b.csv"]
     found = huddle("import", *two, *given, "-o", tmp_path / "two.h5")
     assert "no date in the files of a, b: taken to begin at the same instant" in found.stderr
+    dated = "time,C.X\n2026-11-30T00:00:00Z,1\n2026-11-30T00:00:00.01Z,3\n"
+    (tmp_path / "c.csv").write_text(dated, encoding="utf-8")
+    found = huddle("import", two[0], tmp_path / "c.csv", *given, "-o", tmp_path / "mixed.h5")
+    assert "no date in the files of a: taken to begin in 1970" in found.stderr
     assert "1970" not in found.stdout
     found = huddle("import", tmp_path / "both.csv", *given, "-o", tmp_path / "one.h5")
     assert "no date in" not in found.stderr
