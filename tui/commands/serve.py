@@ -317,9 +317,9 @@ def _locked(bench: Bench, folder: Path) -> Lock:
 def _snapshot(bench: Bench, path: Path) -> Path:
     """Return a copy of the accepted bench file, which recorders read whatever becomes of it."""
     from daq.whole_file import write_whole
-    from tui.service.records.places import file_name
+    from tui.service.records.places import served_file
 
-    copy = bench.recording_directory / f".{file_name(bench.name)}.toml"
+    copy = served_file(bench)
     try:
         write_whole(copy, bench.text.encode())
         copy.chmod(0o600)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import typer
 
+from daq.errors import BenchFileError
 from daq.recorder.schedule import utc_now
 from tui.commands.options import command
-from tui.output.console import for_people, write_json
+from tui.output.console import for_people, notices, write_json
 from tui.output.exit_codes import ExitCode
 from tui.service.records.store import RunStore
 
@@ -27,15 +28,27 @@ def status(path: Path, *, json: str | None = None) -> None:
     huddle status lab.toml --json -
     """
     from daq.devices.bench_file import load
+    from tui.service.records.places import served_file
     from tui.service.status import service_status, status_lines
 
-    bench = load(path)
+    try:
+        bench = load(path)
+    except BenchFileError:
+        notices().print("a running service goes on with the bench file that it accepted before")
+        raise
     runs = RunStore(bench.recording_directory).current(bench.name)
     bench.recording_directory.mkdir(parents=True, exist_ok=True)
     found = service_status(bench, runs, utc_now())
     screen = for_people(json)
     for line in status_lines(found):
         screen.print(line, soft_wrap=True)
+    served = served_file(bench)
+    if found["running"] and served.exists() and served.read_text("utf-8") != bench.text:
+        notices().print(
+            f"{path} has changed, and the service runs on what it accepted before: send SIGHUP;"
+            " if that was refused, its log says why",
+            soft_wrap=True,
+        )
     write_json(json, found)
     if not found["running"]:
         raise typer.Exit(ExitCode.TROUBLE)

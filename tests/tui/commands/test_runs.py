@@ -29,7 +29,7 @@ from tui.commands.main import app
 from tui.commands.tui_controls import pin
 from tui.output.csv_text import csv_text
 from tui.service.processes.locks import Lock
-from tui.service.records.places import Place, service_lock
+from tui.service.records.places import Place, served_file, service_lock
 from tui.service.records.run_state import Run, RunState
 from tui.service.records.store import RunStore, StoreError
 
@@ -134,6 +134,16 @@ def test_status_with_and_without_a_service(place: Path) -> None:
     assert bench is not None
     lock = Lock.take(service_lock(bench))
     assert lock is not None
+    served_file(bench).write_text(bench.text, encoding="utf-8")
+    text = words_of("status", str(place))
+    assert "has changed" not in text
+    edited = bench.text + "\n# another"
+    place.write_text(edited, encoding="utf-8")
+    assert "has changed, and the service runs on what it accepted" in words_of("status", str(place))
+    place.write_text("name = ", encoding="utf-8")
+    said = words_of("status", str(place), code=2)
+    assert "goes on with the bench file that it accepted before" in said
+    place.write_text(bench.text, encoding="utf-8")
     text = printed("status", str(place))
     lock.release()
     assert "service    running" in text

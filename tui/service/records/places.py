@@ -72,6 +72,11 @@ def service_lock(bench: Bench) -> Path:
     return bench.recording_directory / f".{file_name(bench.name)}.service"
 
 
+def served_file(bench: Bench) -> Path:
+    """Return the copy of the bench file that the service of a bench has accepted."""
+    return bench.recording_directory / f".{file_name(bench.name)}.toml"
+
+
 def file_name(name: str) -> str:
     """Return the name of a bench as a part of a file name."""
     return "".join(c if c.isalnum() or c in "-_." else "-" for c in name)
