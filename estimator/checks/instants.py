@@ -13,6 +13,7 @@ is in standard deviations of a normal variable.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Literal, TypeAlias
@@ -24,8 +25,9 @@ from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
 Samples: TypeAlias = NDArray[np.floating[Any]]
-Form: TypeAlias = Literal["curve", "gain", "instants", "filled"]
-"""Of what depends on the motion; "filled": what is there where motion, or its slope, is small."""
+Form: TypeAlias = Literal["curve", "product", "gain", "instants", "filled"]
+"""Of what depends on the motion; "product": as that of two channels of a sensor; "filled": what is
+there where motion, or its slope, is small."""
 WIDTH = 4.0
 """Highest over lowest frequency of a band."""
 LEAST_BINS = 16
@@ -33,7 +35,7 @@ LEAST_BINS = 16
 NOT_WEAK, LOUD = 4.0, 50.0
 """Power of a channel over what others do not predict, from which it is compared, and named."""
 VERY_LOUD = 1000.0
-"""The same for curves: what is predicted has noise of others, and bends beside weak motion."""
+"""The same for curves and products: noise in what is predicted bends it beside weak motion."""
 CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
 PART = 0.4
@@ -167,37 +169,28 @@ class _Sensor:
         tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (there < 1 / NOT_WEAK))
         if not len(tested):
             return
-        motion, rest = self.motion[tested], self.rest[tested, :, own]
-        rest = rest / np.sqrt(left[tested, None, own])
-        n = 2 * (int(1.25 * own.stop) + 1)
-        middle = slice(n // 4, n - n // 4)
-        at = np.arange(n)[middle] * (len(self.window) / n)
-        w = np.interp(at, np.arange(len(self.window)), self.window).astype(np.float32)
-
-        def course(spectrum: NDArray[np.complex64], first: int) -> Samples:
-            padded = np.zeros((*spectrum.shape[:2], first + spectrum.shape[2]), np.complex64)
-            padded[..., first:] = spectrum
-            return np.asarray(np.fft.irfft(padded, n)[..., middle] / w)
-
         turn = (2j * np.pi * self.frequency).astype(np.complex64)
-        x, r = course(motion[:, :, own], own.start), course(rest, own.start)
-        slope = course(turn[own] * motion[:, :, own], own.start)
-        r = _left(r, *(np.gradient(w) / w * each for each in (x, slope)))
+        rest = self.rest[tested] / np.sqrt(np.maximum(left[tested, None], _LEAST))
+        motion, course = self.motion[tested], _Courses(self.window, own.stop)
+        x, slope = course(motion, own), course(turn * motion, own)
+        r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
-        # noise is in the motion, too, and has something in common with that of one segment
-        size = np.einsum("cst,cst->cs", x, x)
-        along = np.einsum("cst,cst->cs", r, x) / np.maximum(size, _LEAST)
-        r = r - along[..., None] * x
         (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
         curve = of_curve = np.zeros(len(tested))
+        by_product, of_product = curve, of_curve
         if is_highest:
-            curve, of_curve = _curve(r, course(motion[:, :, 1:], 1))
-            curve = np.where(there[tested] < 1 / VERY_LOUD, curve, 0.0)
+            x = course(motion, slice(1, None))
+            r = _left(course(rest, slice(2, own.stop)), x, course.edges * x)
+            curve, of_curve = _curve(r, x)
+            pairs = itertools.combinations(x, 2)
+            found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
+            by_product, of_product = max(found, key=lambda each: each[0].max())
+            curve, by_product = np.where(there[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
         # all channels of a sensor are sampled at one instant; their residuals are not independent
         instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
-        forms: tuple[Form, ...] = ("gain", "instants", "curve")
-        evidence = np.stack([np.abs(gain), np.abs(instants), curve])
-        shares = np.stack([of_gain, of_instants, of_curve])
+        forms: tuple[Form, ...] = ("gain", "instants", "product", "curve")
+        evidence = np.stack([np.abs(gain), np.abs(instants), by_product, curve])
+        shares = np.stack([of_gain, of_instants, of_product, of_curve])
         band = float(self.frequency[own.start]), float(self.frequency[own.stop - 1])
         for place, best in enumerate(evidence.argmax(axis=0).tolist()):
             channel, share, form, size = int(tested[place]), shares[best, place], forms[best], 0.0
@@ -207,11 +200,11 @@ class _Sensor:
             most = WITHIN_BAND * left[channel]
             if share < 0:
                 form = "filled"
-            elif form != "curve":
+            elif form in {"gain", "instants"}:
                 scale = np.mean(squares[0][place]) / np.mean(squares[best][place])
                 size = float(np.sqrt(share * there[channel] * scale))
             share = min(abs(share), 1.0)
-            if size and WITHIN_BAND * share < 1:
+            if (size or form == "product") and WITHIN_BAND * share < 1:
                 alike = felt[channel] * size**2 * (1.0 if form == "gain" else np.abs(turn) ** 2)
                 alike = np.maximum(share * left[channel, own].mean(), alike)
                 most = np.minimum(WITHIN_BAND * alike, most)
@@ -227,12 +220,59 @@ class _Sensor:
             )
 
 
-def _left(r: Samples, *edges: Samples) -> Samples:
-    """Return residuals without what the edges of windows let through of linear responses."""
+class _Courses:
+    """Courses of time of spectra of segments, up to the end of a band, without their windows.
+
+    Attributes
+    ----------
+    edges : float32, shape (n_samples,)
+        Slope of the window over it.
+    """
+
+    def __init__(self, window: FloatArray, stop: int) -> None:
+        self._n = n = 2 * (int(1.25 * stop) + 1)
+        self._middle = slice(n // 4, n - n // 4)
+        at = np.arange(n)[self._middle] * (len(window) / n)
+        self._window = np.interp(at, np.arange(len(window)), window).astype(np.float32)
+        self.edges = np.gradient(self._window) / self._window
+
+    def __call__(self, spectra: NDArray[np.complex64], some: slice) -> Samples:
+        """Return the middle half of segments, from some of the frequencies."""
+        padded = np.zeros_like(spectra[..., : some.stop])
+        padded[..., some] = spectra[..., some]
+        return np.asarray(np.fft.irfft(padded, self._n)[..., self._middle] / self._window)
+
+
+def _left(r: Samples, motion: Samples, *edges: Samples) -> Samples:
+    """Return residuals without what the edges of windows let through of linear responses.
+
+    Noise is in the motion, too, and has something in common with that of one segment: the rest is
+    without that.
+    """
     gram = np.einsum("acst,bcst->cab", edges, edges)
     along = np.einsum("acst,cst->ca", edges, r)
     much = (np.linalg.pinv(gram, hermitian=True) @ along[..., None])[..., 0]
-    return np.asarray(r - np.einsum("acst,ca->cst", edges, much))
+    r = r - np.einsum("acst,ca->cst", edges, much)
+    size = np.einsum("cst,cst->cs", motion, motion)
+    common = np.einsum("cst,cst->cs", r, motion) / np.maximum(size, _LEAST)
+    return np.asarray(r - common[..., None] * motion)
+
+
+def _evidence(along: FloatArray) -> FloatArray:
+    """Return how far the mean over segments, (n_channels, n_segments), is from 0 (Student)."""
+    n = along.shape[1]
+    t = along.mean(axis=1) / np.maximum(along.std(axis=1, ddof=1), _LEAST) * np.sqrt(n)
+    normal = np.sqrt((n - 1) * np.log1p(t**2 / (n - 1))) * (8 * n - 7) / (8 * n - 5)  # Wallace
+    return np.asarray(np.copysign(normal, t))
+
+
+def _of_product(r: Samples, product: Samples) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise that is as a product, shape (n_channels,)."""
+    product = product - product.mean(axis=1, keepdims=True)
+    size = np.sqrt(np.einsum("st,st->s", product, product))
+    along = np.einsum("cst,st->cs", r, product / np.maximum(size, _LEAST)[:, None])
+    power = np.einsum("cst,cst->c", r, r)
+    return np.abs(_evidence(along)), along.mean(axis=1) ** 2 * len(size) / np.maximum(power, _LEAST)
 
 
 def _of_square(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
@@ -241,8 +281,8 @@ def _of_square(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
     Both of shape (n_channels, n_segments, n_samples). Means of short pieces are taken off: loudness
     that noise and motion have in common is none that follows the motion at every instant.
     """
-    n, n_pieces = r.shape[1], r.shape[2] // PIECE
-    shape = (-1, n, n_pieces, PIECE)
+    n_pieces = r.shape[2] // PIECE
+    shape = (*r.shape[:2], n_pieces, PIECE)
     power, square = (e[..., : n_pieces * PIECE].reshape(shape) for e in (r**2, square))
     of_noise, of_motion = (
         np.maximum(each.mean(axis=(2, 3), dtype=np.float64), _LEAST) for each in (power, square)
@@ -251,10 +291,8 @@ def _of_square(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
     number = PIECE * n_pieces
     along = np.einsum("cspt,cspt->cs", power, square) / number / (of_noise * of_motion)
     spread = np.einsum("cspt,cspt->cs", square, square) / number / of_motion**2
-    mean = along.mean(axis=1)
-    t = mean / np.maximum(along.std(axis=1, ddof=1), _LEAST) * np.sqrt(n)
-    normal = np.sqrt((n - 1) * np.log1p(t**2 / (n - 1))) * (8 * n - 7) / (8 * n - 5)  # Wallace
-    return np.copysign(normal, t), mean / np.maximum(spread.mean(axis=1), _LEAST)
+    share = along.mean(axis=1) / np.maximum(spread.mean(axis=1), _LEAST)
+    return _evidence(along), share
 
 
 def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:

@@ -404,6 +404,12 @@ def _converter(scene: Scene) -> None:
     scene.felt[BROKEN, :, 0] += 2e-3 * x.std() * np.sin(4 * np.pi * x / x.std())
 
 
+def _product(scene: Scene) -> None:
+    """Add a product of the motion along two axes, or a square of that along one."""
+    x = scene.felt[BROKEN]
+    x[:, 0] += 1e-3 * x[:, -1] * x[:, -2 if scene.n_channels > 1 else 0] / x[:, 0].std()
+
+
 def _fills_gaps(scene: Scene) -> None:
     """Fill 200 gaps of 5 samples by straight lines: before noise, which they lack, too."""
     both = scene.felt[BROKEN] + scene.noise[BROKEN]
@@ -561,6 +567,7 @@ KINDS: Mapping[str, Kind] = {
     "a channel has play of 0.005 rms": Kind(_has_play, AT_INSTANTS),
     "a channel is slower than 2.8 rms of its slope": Kind(_slow, (*AT_INSTANTS, *STEADY)),
     "a converter has steps of 2e-3 rms": Kind(_converter, AT_INSTANTS),
+    "a channel has a product of 1e-3 of two axes": Kind(_product, AT_INSTANTS),
     "200 gaps of 50 ms are filled by lines": Kind(
         _fills_gaps, (*AT_INSTANTS, *STEADY, "DisturbedSegments", "ChannelsStoodStill")
     ),

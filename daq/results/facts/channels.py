@@ -284,6 +284,8 @@ class NoiseDependsOnMotion(Fact):
         elif self.form == "filled":
             what = f"Noise of {who} is larger where its motion is smaller"
             do = "are samples filled in?"
+        elif self.form == "product":
+            what = f"{who} has a product of motion along two axes"
         else:
             what = f"{who} bends, by neither squares nor cubes"
         return Words(
@@ -427,8 +429,11 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
         first, *_ = of_sensor
         if sensor in much:
             continue
+        inside = slice(int(edges[0]), int(edges[-1]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares_of = [np.nanmean(e.most[inside] / noise[inside, e.column]) for e in of_sensor]
         yield NoiseDependsOnMotion(
-            rank=Rank.DELAYS,
+            rank=Rank.DELAYS if max(shares_of) > MUCH_NONLINEAR else Rank.TO_KNOW,
             sensors=(sensor,),
             channels=tuple(
                 snapshot.channels[column].name for column in sorted({e.column for e in of_sensor})

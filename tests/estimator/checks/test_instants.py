@@ -69,6 +69,17 @@ def test_a_gain_that_jitters_within_segments_has_its_size() -> None:
     assert found[0].size == pytest.approx(0.005 / np.sqrt(2), rel=0.4)
 
 
+def test_a_product_of_two_axes_is_in_its_channel() -> None:
+    rng = np.random.default_rng(6)
+    sensors = bench(rng, 45.0, 3, 3)
+    x = sensors[1]
+    x[:, 0] += 2e-3 * x[:, 1] * x[:, 2] / x[:, 1].std()
+    found = dependences(rng, sensors)
+    assert {(each.channel, each.form) for each in found} == {(3, "product")}
+    added = 4e-6 * np.var(x[:, 2]) * 2 / RATE
+    assert 1 < np.median(found[0].explained) / added < 4  # of the power below half the rate
+
+
 @pytest.mark.parametrize("kind", ["play", "steps of a converter"])
 def test_what_bends_otherwise_is_a_curve(kind: str) -> None:
     rng = np.random.default_rng(3)
