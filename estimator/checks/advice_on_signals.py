@@ -89,8 +89,8 @@ class NoSharedMotion(Advice):
     def _words(self, names: Names) -> Words:
         line = (
             f"{names.list_sensors(self.sensors)} records none of the motion that "
-            f"{few([names.sensors[each] for each in self.partners])} share: check its input or "
-            "its place"
+            f"{few([names.sensors[each] for each in self.partners])} share: check its input, "
+            "rate or place"
         )
         partners = names.list_sensors(self.partners)
         if self.for_part:
@@ -113,7 +113,7 @@ class NoSharedMotion(Advice):
                 if len(self.partners) < 3
                 else "."
             ),
-            "Check its input and its place: it must stand beside the others on the same floor.",
+            "Check its input, its sampling rate and its place: beside the others on one floor.",
         )
 
 

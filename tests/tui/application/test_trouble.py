@@ -193,7 +193,7 @@ async def test_a_sensor_moved_during_a_test_is_named_by_the_last_minute(
             await app.workers.wait_for_complete()
         app = HuddleApp(told)
     assert [each for each in told.announced if words in each] == [
-        f"trouble: {words}: check its input or its place"
+        f"trouble: {words}: check its input, rate or place"
     ]
 
 
