@@ -46,6 +46,7 @@ from daq.recording.reader import Recording
 from estimator.errors import EstimatorError
 from estimator.spectra.parts import MOST, PieceEnds, part_bins
 from estimator.spectra.segment_rejection import Reason
+from estimator.spectra.welch import SegmentSpectra, kept_bins
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -351,10 +352,14 @@ class StretchPass(Pass):
         bins = part_bins(len(self.welch.frequencies), self.n_channels, BINS)
         end = self.n_seen if place is None else place
         ends = PieceEnds(bins, -(-self._places // PARTS), end)
-        spectra = self.drain(last=place is None, ends=ends)
+        kept = kept_bins(len(self.welch.frequencies))
+        some = bins[(bins >= kept.min(initial=len(bins))) & (bins <= kept.max(initial=0))]
+        segments = SegmentSpectra(some[::2], self.n_channels)
+        spectra = self.drain(last=place is None, ends=ends, segments=segments)
         if spectra.n_segments and self._number is not None:
             start, (estimator, grid) = self._number * self._stretch_ns, self._estimator
-            share = estimator.left_by_changes(spectra, end, self.aligned.usable)
+            at = self.kept_at[-spectra.n_segments :]
+            share = estimator.left_by_changes(spectra, at, end, self.aligned.usable)
             self.changed[start] = grid.mean(share)
             self._writer.append(start, spectra.n_segments, spectra.csm())
             self.n_stretches += 1

@@ -128,7 +128,7 @@ class CrossSpectra:
             raise EstimatorError(f"{n_channels} channels; expected at least one")
         self.settings = settings
         self.n_channels = n_channels
-        self._single = segments
+        self.segments = segments
         self.ends = ends
         self.n_segments = 0
         length = settings.segment_length
@@ -195,8 +195,8 @@ class CrossSpectra:
 
     def _add(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
         self._products.add(spectra, products)
-        if self._single is not None:
-            self._single.add(spectra[:, self._single.bins])
+        if self.segments is not None:
+            self.segments.add(spectra[:, self.segments.bins])
         self.n_segments += len(spectra)
 
     def products(self, spectra: ComplexArray, out: FloatArray | None = None) -> FloatArray | None:
@@ -213,8 +213,8 @@ class CrossSpectra:
         `single` are their spectra at the bins of `segments`, which must be kept.
         """
         self._products.add_gram(products)
-        if self._single is not None:
-            self._single.add(single)
+        if self.segments is not None:
+            self.segments.add(single)
         self.n_segments += len(single)
 
     def check(self, samples: FloatArray, starts: IntArray) -> None:

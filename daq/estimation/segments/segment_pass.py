@@ -315,15 +315,19 @@ class Pass:
         """Segments that are read together."""
         return max(1, _VALUES_AT_ONCE // (self.welch.hop * self.n_channels))
 
-    def drain(self, *, last: bool, ends: PieceEnds | None = None) -> CrossSpectra:
+    def drain(
+        self, *, last: bool, ends: PieceEnds | None = None, segments: SegmentSpectra | None = None
+    ) -> CrossSpectra:
         """Return the spectra since the last call; none with octaves.
 
         Segments held back for judgement are among the next ones, unless these are the last. `ends`
-        receives the sums of the next ones at the ends of parts.
+        receives the sums of the next ones at the ends of parts, `segments` their spectra where none
+        is held back.
         """
         self._ends = None  # the sums begin again: no parts of the recording are kept of them
         if self._undisturbed is None:
-            spectra, self._all = self._all, CrossSpectra(self.welch, self.n_channels, ends=ends)
+            spectra = self._all
+            self._all = CrossSpectra(self.welch, self.n_channels, ends=ends, segments=segments)
             return spectra
         self._selected = None
         return self._undisturbed.spectra() if last else self._undisturbed.drain(ends)

@@ -412,13 +412,15 @@ def test_what_counts_show_of_their_limits_is_kept(tmp_path: Path) -> None:
         assert pooled.diagnostics.faulty == {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize("apart", [0, 1, 24])
+@pytest.mark.parametrize(("apart", "steps"), [(0, 1), (0, 47), (1, 0), (24, 0)])
 def test_a_response_that_changes_within_or_between_hours_or_days_is_in_the_intervals(
-    tmp_path: Path, apart: int
+    tmp_path: Path, apart: int, steps: int
 ) -> None:
+    """Between recordings, once within one, or in the middle of each of 24 parts of it."""
+
     def louder(name: str, counts: NDArray[np.int32]) -> NDArray[np.int32]:
         gain = np.full((len(counts), 1), 1.2 if name == "A" else 1.0)
-        gain[: len(gain) // 2 if apart == 0 else 0] = 1.0
+        gain[np.arange(len(gain)) * (steps + 1) // len(gain) % 2 != steps % 2] = 1.0
         return np.asarray(np.rint(counts * gain), np.int32)
 
     paths = [record(tmp_path / "a.h5", hours=0.5)] if apart else []
