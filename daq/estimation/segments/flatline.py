@@ -4,12 +4,13 @@ A channel whose count does not change for a moment has lost its signal, or its c
 coarse. One that stands still most of the time is no news: it is dead, or always that coarse. A
 straight line fills a gap, or a spline, which is one cubic from end to end. It is exact but for
 rounding, of counts or of decimals, while neighbouring samples usually differ by more: else it may
-be slow motion.
+be slow motion. Straight lines through a few samples fill short gaps.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
@@ -24,6 +25,11 @@ _SLOPE = 16  # counts of that range, from which whole numbers follow a curve
 _HALF = 0.5 + 1e-9  # counts: rounding of the points, which the curve enlarges, and of those between
 _SMOOTH = 3  # sizes below the usual second difference, from which a curve is no motion
 _SIZES = 64  # factors of four, from 4**-32
+_RUN = 4  # samples of a short gap, which lie on a line with those beside them
+_BESIDE = 16  # samples before and after, which are not quiet
+_EXACT, _OF_COUNTS = 1e-6, 2.0  # of the usual second difference, or counts: those of such a gap
+_COARSE = 400.0  # counts of the usual second difference below which two are no sign of a line
+_FEW = 8  # short gaps that may be chance
 
 
 def stands_still(samples: FloatArray) -> NDArray[np.bool_]:
@@ -48,9 +54,10 @@ class FlatlineDetector:
         self._n_parts = max(1, min(_PARTS, hop // _MIN_SAMPLES))
         self._length = hop // self._n_parts
         self._seconds = hop / self._n_parts / sampling_rate
-        self.counts = np.zeros((1 + 2 * _SIZES, n_channels), dtype=np.int64)
+        self.counts = np.zeros((2 + 2 * _SIZES, n_channels), dtype=np.int64)
         """Parts in which each channel stood still; by size, those with such a second difference,
-        and those that leave a curve by so much."""
+        and those that leave a curve by so much; runs of samples on a line."""
+        self._per_run = _RUN / sampling_rate
         self._curves = []
         for points, share in _CURVES:
             at = np.rint(np.linspace(0, self._length - 1, points)).astype(int)
@@ -59,6 +66,7 @@ class FlatlineDetector:
 
     def add(self, samples: FloatArray, usable: NDArray[np.bool_]) -> None:
         """Look at whole hops of `samples`, shape (n_samples, n_channels), where all are usable."""
+        self._look_for_runs(samples, usable)
         n_hops = len(samples) // self._hop
         shape = (n_hops, self._hop, samples.shape[1])
         parts = samples[: n_hops * self._hop].reshape(shape)[:, : self._n_parts * self._length]
@@ -92,6 +100,29 @@ class FlatlineDetector:
         self.counts[0] += still.sum(axis=0)
         self._count(1 + _SIZES, nearest, np.isfinite(nearest) & ~still)
 
+    def _look_for_runs(self, samples: FloatArray, usable: NDArray[np.bool_]) -> None:
+        """Count runs of samples on a line, of which every one has a sample that is looked at."""
+        at = np.arange(_BESIDE, len(samples) - _BESIDE, _RUN)
+        if not len(at):
+            return
+        end = len(samples) - _BESIDE
+        before, here, after = (samples[_BESIDE + n : end + n : _RUN] for n in (-1, 0, 1))
+        bend = before - 2 * here + after
+        some = slice(None, None, max(1, len(at) // 256))
+        usual = np.median(np.abs(bend[some]), axis=0)
+        whole = (np.rint(here[some]) == here[some]).all(axis=0)
+        allowed = np.where(whole, _OF_COUNTS, _EXACT * usual)
+        least = np.where(whole, _COARSE, 1e3 * allowed)
+        row, channel = np.nonzero((np.abs(bend) <= allowed) & (usual > least))
+        near = at[row][:, None] + np.arange(-_BESIDE, _BESIDE + 1)
+        bends = np.abs(np.diff(samples[near, channel[:, None]], 2, axis=1))
+        on_it = bends[:, _BESIDE - _RUN : _BESIDE + _RUN - 1] <= allowed[channel, None]
+        runs = sliding_window_view(on_it, _RUN, axis=1).all(axis=-1).any(axis=-1)
+        ends = (bends[:, : _BESIDE // 2], bends[:, -_BESIDE // 2 :])
+        beside = np.maximum(*(np.median(each, axis=1) for each in ends))
+        runs &= (beside > least[channel]) & usable[near].all(axis=1)
+        self.counts[-1] += np.bincount(channel[runs], minlength=self.counts.shape[1])
+
     def _count(self, row: int, values: FloatArray, which: NDArray[np.bool_]) -> None:
         """Count some values, (n_parts, n_channels), by size, from a row of `counts` on."""
         size = np.frexp(values)[1] // 2 + _SIZES // 2
@@ -103,9 +134,11 @@ class FlatlineDetector:
 
     def for_a_while(self) -> FloatArray:
         """Return for how long each channel was not measured, in seconds; 0 if most of the time."""
-        bends, curves = self.counts[1 : 1 + _SIZES], self.counts[1 + _SIZES :]
+        bends, curves = self.counts[1 : 1 + _SIZES], self.counts[1 + _SIZES : -1]
         seen = bends.sum(axis=0)
         usual = (2 * np.cumsum(bends, axis=0) < seen).sum(axis=0)
         smooth = np.arange(_SIZES)[:, None] <= usual - _SMOOTH
         still = self.counts[0] + (curves * smooth).sum(axis=0)
-        return np.where(2 * still < seen, still * self._seconds, 0.0)
+        runs = np.where(self.counts[-1] > _FEW, self.counts[-1] * self._per_run, 0.0)
+        seconds = np.maximum(still * self._seconds, runs)
+        return np.where(2 * seconds < seen * self._seconds, seconds, 0.0)

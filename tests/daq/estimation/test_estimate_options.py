@@ -195,6 +195,20 @@ def test_gaps_that_a_spline_fills_are_seen(counts: int) -> None:
     assert detector.for_a_while()[0] == pytest.approx(5, abs=1)
 
 
+@pytest.mark.parametrize("counts", [0, 1000])
+def test_short_gaps_that_lines_fill_are_seen(counts: int) -> None:
+    rng = np.random.default_rng(5)
+    samples = rng.standard_normal((60_000, 2)) * max(counts, 1)
+    for at in 100 * rng.choice(np.arange(1, 599), 50, replace=False):
+        before, after = samples[[at - 1, at + 8], 1]
+        samples[at : at + 8, 1] = np.linspace(before, after, 10)[1:-1]
+    samples = np.rint(samples) if counts else samples
+    detector = FlatlineDetector(500, 2, RATE)
+    for some in np.split(samples, 6):
+        detector.add(some, np.ones(len(some), np.bool_))
+    assert detector.for_a_while() == pytest.approx([0, 50 * 8 / RATE], rel=0.1)
+
+
 def test_slow_motion_in_coarse_counts_or_gusts_is_not_interpolated() -> None:
     rng, time = np.random.default_rng(0), np.arange(60_000) / RATE
     samples = np.rint(1000 * np.sin(2 * np.pi * 0.1 * time))[:, None].repeat(9, axis=1)
