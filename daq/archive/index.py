@@ -16,7 +16,7 @@ from daq.archive.spectra_file import Described, Origin, SpectraFile
 from daq.bench.channel import Channel
 from daq.bench.sensitivity import as_document, sensitivities_from
 from daq.caveats import Caveat, Caveats
-from daq.estimation.snapshot import overlaps_from
+from daq.estimation.snapshot import Overlap
 from daq.recording.file_format import channel_attributes, channels_of, plain
 from estimator.checks.count_limits import CountLimits
 from estimator.spectra.segment_rejection import Reason
@@ -104,7 +104,7 @@ class Index:
                 not_understood=tuple(found.pop("not_understood")),
                 caveats=Caveats(map(Caveat, found.pop("caveats"))),
                 sensitivities=sensitivities_from(found.pop("sensitivities")),
-                overlaps=overlaps_from(found.pop("overlaps")),
+                overlaps=tuple(Overlap(*each) for each in found.pop("overlaps")),
                 **{name: found.pop(name) for name in PLAIN},
             )
             return IndexEntry(path, described, **found)
@@ -124,7 +124,6 @@ class Index:
             "origin": asdict(described.origin),
             "counts": asdict(described.counts),
             "sensitivities": as_document(described.sensitivities),
-            "overlaps": [asdict(each) for each in described.overlaps],
             "channels": key,
             "start_utc_ns": entry.start_utc_ns,
             "n_segments": entry.n_segments,

@@ -27,7 +27,7 @@ from daq.bench.channel import Channel
 from daq.bench.sensitivity import Sensitivities, as_document, sensitivities_from
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
-from daq.estimation.snapshot import Overlap, overlaps_from
+from daq.estimation.snapshot import Overlap
 from daq.recording.file_format import channel_attributes, channels_of
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.packing import check_chunks
@@ -296,7 +296,7 @@ class SpectraWriter:
                 "lacking": json.dumps(dict(described.lacking)),
                 "shortened": json.dumps(dict(described.shortened)),
                 "sensitivities": json.dumps(as_document(described.sensitivities)),
-                "overlaps": json.dumps([asdict(each) for each in described.overlaps]),
+                "overlaps": json.dumps(described.overlaps),
                 "daily": int(self._daily),
                 "single": int(self._single),
             }
@@ -377,7 +377,7 @@ class SpectraFile:
                 for sensor, (late, early) in _table(attributes, "shortened", optional=True).items()
             },
             sensitivities=sensitivities_from(json.loads(attributes.get("sensitivities", "[]"))),
-            overlaps=overlaps_from(json.loads(attributes.get("overlaps", "[]"))),
+            overlaps=tuple(Overlap(*o) for o in json.loads(attributes.get("overlaps", "[]"))),
         )
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))

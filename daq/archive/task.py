@@ -216,7 +216,7 @@ def _written(
         each = StretchPass(recording, plan, writer, day_ns)
         plan.check_fits(each)
         for name, begin, end in task.repeated:
-            each.leave_to(name, (begin, end))
+            each.leave_to(name, begin, end)
         each.doubt_stated_times()
         each.finish()
         each.end_stretch()

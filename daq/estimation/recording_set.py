@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.bench.durations import format_duration
+from daq.caveats import Caveat
 from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError, RecordingError, WrongSettingError
 from daq.estimation.segments.segment_pass import Pass
@@ -154,18 +155,19 @@ def check_same(passes: Sequence[Pass]) -> None:
 def leave_out_repeated(each: Pass, before: Sequence[Pass]) -> None:
     """Exclude from a recording the time that others cover: segments do not count twice.
 
-    Recordings without a date share a start: these cover one time only if their samples are equal.
+    Recordings without a date share a start, and simulated ones are written faster than their time
+    passes: these cover one time only if their samples are equal.
     """
     for other in before:
-        span, own = other.span_ns, each.span_ns
+        span, own, shift = other.span_ns, each.span_ns, 0
         if span is None or own is None:
             continue
-        dated = min(span[0], own[0]) >= FIRST_DATE_NS
-        if dated:
-            each.leave_to(other.recording.path.name, span)
-        elif _begin_alike(each.recording, other.recording):
-            length = span[1] - span[0]
-            each.leave_to(other.recording.path.name, (own[0], own[0] + length), dated=False)
+        simulated = Caveat.SIMULATED in each.recording.caveats
+        if simulated or min(span[0], own[0]) < FIRST_DATE_NS:
+            if not _begin_alike(each.recording, other.recording):
+                continue
+            shift = own[0] - span[0]
+        each.leave_to(other.recording.path.name, span[0] + shift, span[1] + shift)
 
 
 def _begin_alike(one: ReadableRecording, other: ReadableRecording) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
 from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,22 +143,16 @@ class NoSegment:
     longest: float
 
 
-@dataclass(frozen=True, slots=True)
-class Overlap:
-    """Two recordings, by name, that cover the same time, in ns of UTC; None if they have no date.
+class Overlap(NamedTuple):
+    """Two recordings, by name, that cover the same time, in ns of UTC.
 
-    `repeated` is the one whose segments there do not count.
+    Segments there count in the first, and not in the second.
     """
 
     counted: str
     repeated: str
-    time_utc_ns: tuple[int, int] | None
-    seconds: float
-
-
-def overlaps_from(found: Iterable[dict[str, Any]]) -> tuple[Overlap, ...]:
-    """Return overlaps from JSON."""
-    return tuple(Overlap(**each | {"time_utc_ns": tuple(each["time_utc_ns"])}) for each in found)
+    begin_ns: int
+    end_ns: int
 
 
 @dataclass(frozen=True, slots=True)

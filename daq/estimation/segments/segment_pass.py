@@ -807,20 +807,17 @@ class Pass:
         edges = ((np.array(each) - origin) * 1e-9 * rate for each in self._stretches)
         return [(int(first), int(end)) for first, end in (np.ceil(at - _NEAR) for at in edges)]
 
-    def leave_to(self, name: str, span: tuple[int, int], *, dated: bool = True) -> None:
+    def leave_to(self, name: str, begin: int, end: int) -> None:
         """Exclude what another recording covers, in ns of UTC, but for half a segment at its ends.
 
-        So nothing is excluded where one recording continues another. Times of recordings that are
-        not `dated` are not stated.
+        So nothing is excluded where one recording continues another.
         """
         margin = round(self.welch.segment_length / self.welch.sampling_rate * 5e8)
-        low, high = span[0] + margin, span[1] - margin
-        own = self.span_ns
+        low, high, own = begin + margin, end - margin, self.span_ns
         if own is not None and max(low, own[0]) < min(high, own[1]):
             self._stretches.append((low, high))
-            both = max(span[0], own[0]), min(span[1], own[1])
-            time, seconds = both if dated else None, (both[1] - both[0]) * 1e-9
-            self.overlaps.append(Overlap(name, self.recording.path.name, time, seconds))
+            both = max(begin, own[0]), min(end, own[1])
+            self.overlaps.append(Overlap(name, self.recording.path.name, *both))
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from daq.caveats import Caveat
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import SensorTotals, Snapshot
+from daq.formats.foreign_sensor import FIRST_DATE_NS
 from daq.recording.monitor import RecordingStatus
 from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import Fact
@@ -223,13 +224,14 @@ def facts_of_recordings(snapshot: Snapshot) -> Iterator[Fact]:
         yield _OF_CAVEATS[caveat](rank=Rank.TO_KNOW)
     for file in snapshot.left_open:
         yield RecordingLeftOpen(rank=Rank.DELAYS, file=file)
-    for both in snapshot.overlaps:
+    for counted, repeated, begin, end in snapshot.overlaps:
+        seconds = (end - begin) * 1e-9
         yield RecordingsOverlap(
-            rank=Rank.DELAYS if both.seconds > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
-            counted=both.counted,
-            repeated=both.repeated,
-            time_utc_ns=both.time_utc_ns,
-            duration=both.seconds,
+            rank=Rank.DELAYS if seconds > DELAYING_SHARE * snapshot.elapsed else Rank.TO_KNOW,
+            counted=counted,
+            repeated=repeated,
+            time_utc_ns=(begin, end) if begin >= FIRST_DATE_NS else None,
+            duration=seconds,
         )
     for sensor in snapshot.sensors:
         if sensor.is_lost:
