@@ -389,11 +389,14 @@ def _limit_faults(table: Mapping[str, Any], sensors: Sequence[Sensor]) -> Iterat
     until = "" if recording is None else recording.until or ""
     if "decided" in until and not entries:
         yield FileFault("recording.until", "expected [[limits]] to be decided", until)
+    yield from limit_faults([limit for limit in limits if limit is not None], sensors)
+
+
+def limit_faults(limits: Sequence[Limit], sensors: Sequence[Sensor]) -> Iterator[FileFault]:
+    """Yield a fault for each limit of sensors, channels or units that the bench does not have."""
     known_sensors = tuple(sensor.name for sensor in sensors)
     known_channels = tuple(dict.fromkeys(c.name for s in sensors for c in s.channels))
     for limit in limits:
-        if limit is None:
-            continue
         key = f'limits["{limit.name}"]'
         for name in limit.sensors:
             if name not in known_sensors:

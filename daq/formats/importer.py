@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from daq.bench.channel import check_name
-from daq.bench.loading import dump, parse
+from daq.bench.loading import dump, limit_faults, parse
 from daq.bench.model import Bench, Sensor
 from daq.bench.option_fit import misfits
 from daq.bench.units import canonical
 from daq.caveats import Caveat, Caveats
-from daq.errors import ImportFormatError, WrongSettingError
-from daq.formats.assembly import Columns
+from daq.errors import BenchFileError, ImportFormatError, WrongSettingError
+from daq.formats.assembly import SAME_RATE, Columns
 from daq.formats.defaults import from_files, still_chosen
 from daq.formats.memory import RecordingInMemory, SensorInMemory
 from daq.formats.readers.fdsn import FDSN, fetch
@@ -366,6 +366,8 @@ def _ordered(found: dict[str, ForeignSensor], bench: Bench) -> dict[str, Foreign
             f"the bench file has the sensors {', '.join(names)}, the files have "
             f"{', '.join(found)}; expected the same names"
         )
+    if faults := tuple(limit_faults(bench.limits, bench.sensors)):
+        raise BenchFileError(*faults, source="bench file")
     return {name: found[name] for name in names}
 
 
@@ -398,7 +400,10 @@ def _described(
         listed = bench.sensor(foreign.name)
         channels = list(_matched(foreign, listed))
         _refuse_scaling_twice(foreign, channels)
-        found = [_taken(each, "bench") for each in channels]
+        rate, stated = foreign.sampling_rate, listed.sampling_rate
+        differs = [f"{rate:g} Hz as in the file, not {stated:g} Hz as in the bench file"]
+        notes = differs if abs(stated / rate - 1) > 10 * SAME_RATE else []
+        found = [_taken(each, "bench", notes) for each in channels]
         sensor = listed.model_copy(update={"sampling_rate": foreign.sampling_rate})
     stretches = _within(foreign.dated_spans_ns(), span)
     for number, name in enumerate(foreign.channels):

@@ -94,6 +94,20 @@ def test_the_rate_of_files_without_times_and_that_of_a_sensor_are_one_option(
         assert recording.bench.estimate.sampling_rates == {"B": 99.5}
 
 
+def test_a_bench_file_is_compared_with_the_files(tmp_path: Path) -> None:
+    path, bench = tmp_path / "a.csv", tmp_path / "a.toml"
+    path.write_text("A.X,B.X\n" + "1,2\n3,5\n" * 500, encoding="utf-8")
+    sensor = '[[sensors]]\nname="{}"\ndriver="text"\nport="/dev/tty{}"\n'
+    sensor += 'channels=[{{name="X", sensitivity=1}}]\n'
+    text = 'name="a"\nsampling_rate=200\n' + "".join(sensor.format(n, n) for n in "AB")
+    bench.write_text(text, encoding="utf-8")
+    given = ("import", path, "--bench", bench, "--sampling-rate", "100", "-o", tmp_path / "a.h5")
+    assert "100 Hz as in the file, not 200 Hz as in the bench file" in huddle(*given).output
+    limit = '[[limits]]\nname="l"\nfrequency=[1, 2]\npsd=[1, 1]\nsensors=["Q"]\n'
+    bench.write_text(text + limit, encoding="utf-8")
+    assert 'limits["l"].sensors' in huddle(*given, code=ExitCode.USAGE).stderr
+
+
 def test_files_without_a_date_are_said_to_begin_together(tmp_path: Path) -> None:
     rows = "X\n" + "1\n3\n" * 500
     for name in ("a", "b"):
