@@ -239,9 +239,11 @@ class Delay(Advice):
             be = "are" if polled[1:] else "is"
             line = f"{listed(polled)} {be} polled; let the host do less"
             do = f"{listed(polled)} {be} polled, without a clock to set: let the host do less"
+        time = abs(self.delay) * 1e3
+        by = f"by {time:.3g} ms" if time < 1e3 else f"by {time:.0f} ms"
         return Words(
-            f"{late} lags {early} by {abs(self.delay) * 1e3:.3g} ms: {line}",
-            f"The samples of {late} lag those of {early} by {abs(self.delay) * 1e3:.3g} ms "
+            f"{late} lags {early} {by}: {line}",
+            f"The samples of {late} lag those of {early} {by} "
             f"({abs(self.delay_samples):.2g} samples): {EFFECT_OF_DELAY}.",
             f"{do}, and use a tapered window.",
         )

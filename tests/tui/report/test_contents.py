@@ -18,6 +18,8 @@ from daq.estimation.settings import Settings
 from daq.results.result import Result
 from daq.results.sources import sources
 from tests.command import huddle
+from tests.daq.clocks.recordings import ORIGIN
+from tests.tui import night_recording
 from tests.tui.example_snapshot import SETTINGS, demo_bench, diagnosed
 from tests.tui.night_recording import HOSTILE, N_SAMPLES, RATE, record
 from tests.tui.report.written_report import (
@@ -198,7 +200,11 @@ def test_drift_is_without_its_line_and_the_steps_of_restarts() -> None:
     np.testing.assert_allclose(whole, wander - np.polyval(line, seconds), atol=1e-12)
 
 
-def test_two_recordings_make_one_report(reported: Reported, tmp_path: Path) -> None:
+def test_two_recordings_make_one_report(
+    reported: Reported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = ORIGIN.utc_ns + 3600 * 10**9
+    monkeypatch.setattr(night_recording, "ORIGIN", replace(ORIGIN, utc_ns=later))
     other = record(tmp_path / "second.h5")
     report = report_of(result_of(reported.settings, reported.recording, other))
     text = " ".join(texts_of(report))
