@@ -484,10 +484,11 @@ def may_share(snapshot: Snapshot) -> tuple[BoolArray, BoolArray]:
     """Return where all sensors may share noise, and where two of three may, (n_freqs,) each.
 
     It is where no model that the sensors allow explains the averages; all may share what is too
-    strong to be tilt or gradients of the motion.
+    strong to be tilt or gradients of the motion. Gains of three channels absorb what two share.
     """
     frequency, dims, csm = snapshot.frequency, snapshot.dims, snapshot.csm
     every, two = np.zeros((2, len(frequency)), np.bool_)
+    two[:] = len(dims) == sum(dims) == _THREE
     for low, high in _unexplained(snapshot):
         at = np.flatnonzero((frequency >= low) & (frequency <= high))
         averages = np.full(len(at), snapshot.n_effective)

@@ -88,6 +88,16 @@ def test_two_of_four_channels_are_never_named_without_the_other_two(ratio: float
     assert not named or {(0, 1), (2, 3)} <= named
 
 
+def test_the_bound_of_three_channels_holds_noise_that_two_share() -> None:
+    """Other gains explain it, and no test sees it: a third of these intervals held the noise."""
+    settings = Settings(segment=2.0)
+    samples = recorded(3, 1, 1e5, np.random.default_rng([46, 3, 1]))
+    result = Result(estimate([recording_of_arrays(samples, RATE)], settings), settings)
+    assert not any(isinstance(each, SharedByTwo) for each in result.facts)
+    for noise, true in zip(result.means(result.method, (2.0, 20.0)), (17, 17, 1), strict=True):
+        assert noise.low[0] <= true * UNIT <= noise.high[0]
+
+
 @pytest.mark.parametrize(("n_sensors", "d"), [(4, 3), (6, 1)])
 def test_motion_of_all_sensors_is_no_noise_of_two(n_sensors: int, d: int) -> None:
     settings = Settings(segment=2.0)
