@@ -168,6 +168,7 @@ def test_serial_numbers_tie_benches_together_and_intervals_at_zero_are_left_out(
     runs += [run_with(50, 0.0, low=-1.0)]
     (series,) = history(noise_of(runs))
     assert len(series.noise) == 41
+    assert history([*noise_of(runs), *noise_of(runs)]) == [series]  # a folder and its copy
     assert len(series.usable) == 40
     (change,) = series.changes
     assert series.due_of(change.first) == START + timedelta(days=20)

@@ -108,7 +108,8 @@ def history(
     Parameters
     ----------
     found : iterable of (str, datetime, RecordedNoise, Caveats)
-        Bench, due time, noise and caveats of runs, of any benches.
+        Bench, due time, noise and caveats of runs, of any benches. What a copy of a folder
+        repeats counts once.
     band : (float, float), optional
         In Hz; all bands that were kept, if not given.
     scatter : float
@@ -118,7 +119,7 @@ def history(
         alarm.
     """
     collected: dict[tuple[object, ...], list[Found]] = {}
-    for each in sorted(found, key=lambda each: each[1]):
+    for each in sorted(dict.fromkeys(found), key=lambda each: each[1]):
         noise = each[2]
         if band is None or _same_band(noise, band):
             collected.setdefault((_key(each[0], noise), each[3]), []).append(each)
