@@ -171,10 +171,7 @@ def origin_of(recording: Recording) -> Origin:
     recording.refresh()
     about = recording.path.stat()
     begin = recording.created_at.utc_ns
-    seconds = [
-        (sensor.n_samples + int(sensor.gaps["missing"].sum())) / sensor.sampling_rate
-        for sensor in recording.sensors
-    ]
+    ends = [int(each.blocks[-1:]["utc_ns"][0]) for each in recording.sensors if each.n_samples]
     return Origin(
         run_id=recording.run_id,
         path=str(recording.path.resolve()),
@@ -183,7 +180,7 @@ def origin_of(recording: Recording) -> Origin:
         n_samples=sum(sensor.n_samples for sensor in recording.sensors),
         closed=recording.closed,
         begin_ns=begin,
-        end_ns=begin + round(max(seconds, default=0.0) * 1e9),
+        end_ns=max(ends, default=begin),
     )
 
 
