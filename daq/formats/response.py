@@ -14,6 +14,7 @@ import hashlib
 import math
 import re
 import warnings
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -479,12 +480,13 @@ def _sacpz_codes(about: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _in_order(epochs: Iterable[_Epoch]) -> list[_Epoch]:
-    """Return epochs by their start; one without an end lasts until the next begins."""
+    """Return epochs by their start; one without an end lasts until a later one begins."""
     ordered = sorted(epochs, key=lambda epoch: epoch.start_ns)
-    nexts = [epoch.start_ns for epoch in ordered[1:]] + [_END_OF_TIME_NS]
+    starts = [epoch.start_ns for epoch in ordered]
+    nexts = [starts[bisect_right(starts, each) :] or [_END_OF_TIME_NS] for each in starts]
     return [
-        replace(e, end_ns=min(following, e.end_ns) if e.end_ns > _FAR_NS else e.end_ns)
-        for e, following in zip(ordered, nexts, strict=True)
+        replace(e, end_ns=min(later[0], e.end_ns) if e.end_ns > _FAR_NS else e.end_ns)
+        for e, later in zip(ordered, nexts, strict=True)
     ]
 
 

@@ -258,6 +258,9 @@ def test_a_channel_that_was_not_asked_for_may_have_any_response(tmp_path: Path) 
         responses.of("TM.SKLT", "BHZ")
 
 
+SOME_NS = 1_700_000_000 * 10**9
+
+
 def test_two_files_of_one_code_are_refused_if_they_differ(tmp_path: Path) -> None:
     path = next(p for p in shipped_response_files() if p.name == "IM_IL31__BHZ.xml")
     other = tmp_path / "other.xml"
@@ -267,5 +270,8 @@ def test_two_files_of_one_code_are_refused_if_they_differ(tmp_path: Path) -> Non
     value = re.search(r"<StageGain>\s*<Value>([^<]*)", text)
     assert value is not None
     other.write_text(text.replace(f"<Value>{value[1]}", f"<Value>{2 * float(value[1])}"))
-    with pytest.raises(ImportFormatError, match="several that differ for one time"):
-        Responses([path, other]).of("IM.IL31", "BHZ")
+    both = obspy.read_inventory(str(path)) + obspy.read_inventory(str(other))
+    both.write(str(tmp_path / "both.xml"), format="STATIONXML")
+    for given in ([path, other], [tmp_path / "both.xml"]):
+        with pytest.raises(ImportFormatError, match="several that differ for one time"):
+            Responses(given).of("IM.IL31", "BHZ", [(SOME_NS, SOME_NS + 10**9)])
