@@ -31,9 +31,28 @@ LEAST_BINS = 48
 
 
 @cache
-def lower_triangle(n: int) -> BoolArray:
-    """Return which elements of a matrix are in its lower triangle; made once, for it takes long."""
-    return np.tri(n, dtype=np.bool_)
+def _places(n: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Return where a packed matrix has real and imaginary parts by turns, their signs, and back."""
+    i, j = np.indices((n, n))
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    index = np.stack([high * n + low, low * n + high], axis=2).ravel()
+    sign = np.stack([np.ones((n, n)), np.sign(j - i)], axis=2).ravel()
+    return index, sign, (2 * (i * n + j) + (i < j)).ravel()
+
+
+def packed(matrices: ComplexArray) -> FloatArray:
+    """Return real parts of the lower triangles, with imaginary parts of the upper ones."""
+    n = matrices.shape[-1]
+    flat = np.ascontiguousarray(matrices).view(np.float64).reshape(len(matrices), -1)
+    return np.take(flat, _places(n)[2], axis=1).reshape(matrices.shape)
+
+
+def unpacked(packed: FloatArray) -> ComplexArray:
+    """Return the matrices of which `packed` has real and imaginary parts, of any first axes."""
+    index, sign, _ = _places(packed.shape[-1])
+    flat = np.take(packed.reshape(*packed.shape[:-2], -1), index, axis=-1)
+    flat *= sign
+    return flat.view(np.complex128).reshape(packed.shape)
 
 
 def part_bins(n_freqs: int, n_channels: int, most: int = VALUES) -> IntArray:
@@ -163,7 +182,7 @@ class Parts:
         complex128, shape (n_parts, n_some, n_channels, n_channels)
             In unit**2/Hz; NaN where a response is zero.
         """
-        return self._unpacked(np.stack([part.packed(some) for part in self.each]), some)
+        return self._unpacked(np.stack([part.packed(some) for part in self.each], axis=1), some)
 
     def joined(self, some: slice | IntArray, groups: Sequence[IntArray]) -> Divided:
         """Return the matrices of groups of parts, as `csm` does those of all parts."""
@@ -173,7 +192,7 @@ class Parts:
             for group in groups
         ]
         sums = np.array([averages[own].sum() for own in groups])
-        return Divided(self._unpacked(np.stack(joined), some), sums)
+        return Divided(self._unpacked(np.stack(joined, axis=1), some), sums)
 
     def _merged(self, group: IntArray) -> Iterator[tuple[Part, float]]:
         """Yield parts of a group, neighbours of equal weight as one, and their shares of it."""
@@ -191,17 +210,14 @@ class Parts:
         yield part, share
 
     def _unpacked(self, packed: FloatArray, some: slice | IntArray) -> ComplexArray:
-        turned, lower = packed.swapaxes(2, 3), lower_triangle(packed.shape[-1])
-        found = np.empty(packed.shape, np.complex128)
-        found.real = np.where(lower, packed, turned)
-        found.imag = np.where(lower, -turned, packed)
-        found.imag[..., np.arange(len(lower)), np.arange(len(lower))] = 0.0
+        """Return matrices of packed sums, which have parts as their second axis, also in memory."""
+        found = unpacked(packed).swapaxes(0, 1)
         if self.response is None:
             return found
         response = self.response[some]
         known = np.isfinite(response) & (response != 0)
         inverse = np.where(known, 1 / np.where(known, response, 1), np.nan)
-        return np.asarray(found * inverse[:, :, None] * inverse[:, None, :].conj())
+        return np.asarray(found * (inverse[:, :, None] * inverse[:, None, :].conj()))
 
 
 class PartEnds:

@@ -14,6 +14,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import cache
 from typing import Literal, Self
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.records import dataclass
-from estimator.spectra.parts import Part, PartEnds, lower_triangle
+from estimator.spectra.parts import Part, PartEnds, packed, unpacked
 from estimator.spectra.windows import effective_averages, get_window
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -466,7 +467,7 @@ class _Products:
         elif self.is_small:  # of one segment: cheaper than of real and imaginary parts
             for some in self._pieces:
                 found = spectra[0, some]
-                self._total[some] += _packed(found[:, :, None] * found[:, None, :].conj())
+                self._total[some] += packed(found[:, :, None] * found[:, None, :].conj())
         else:
             self._waiting.append(spectra.copy())
             if sum(map(len, self._waiting)) >= TOGETHER:
@@ -482,7 +483,7 @@ class _Products:
         waiting, self._waiting = self._waiting, []
         for some in self._pieces if waiting else ():
             found = np.concatenate([each[:, some] for each in waiting])
-            self._total[some] += _packed(
+            self._total[some] += packed(
                 np.matmul(found.transpose(1, 2, 0), found.conj().swapaxes(0, 1))
             )
 
@@ -504,9 +505,7 @@ class _Products:
         self._settle()
         found = np.empty(self._total.shape, dtype=np.complex128)
         for some in self._pieces:
-            lower, upper = np.tril(self._total[some]), np.triu(self._total[some], 1)
-            found.real[some] = lower + np.tril(lower, -1).swapaxes(1, 2)
-            found.imag[some] = upper - upper.swapaxes(1, 2)
+            found[some] = unpacked(self._total[some])
         return found
 
     def merge(self, other: _Products) -> None:
@@ -517,19 +516,27 @@ class _Products:
 
     def add_total(self, total: ComplexArray) -> None:
         """Add what `total` returned."""
-        self._total += _packed(total)
-
-
-def _packed(matrices: ComplexArray) -> FloatArray:
-    """Return real parts of the lower triangles, with imaginary parts of the upper ones."""
-    return np.where(lower_triangle(matrices.shape[1]), matrices.real, matrices.imag)
+        self._total += packed(total)
 
 
 def _add_gram(total: FloatArray, gram: FloatArray) -> None:
     """Add products of complex numbers, given those of their real and imaginary parts."""
-    real = gram[:, ::2, ::2] + gram[:, 1::2, 1::2]
-    imag = gram[:, 1::2, ::2] - gram[:, ::2, 1::2]
-    total += np.where(lower_triangle(total.shape[1]), real, imag)
+    one, other, sign = _of_gram(total.shape[1])
+    flat = gram.reshape(len(gram), -1)
+    own = np.take(flat, other, axis=1)
+    own *= sign
+    own += np.take(flat, one, axis=1)
+    total += own.reshape(total.shape)
+
+
+@cache
+def _of_gram(n: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return which two products each element of a packed sum has, and the sign of the second."""
+    i, j = 2 * np.indices((n, n))
+    upper = i < j
+    one = (i + upper) * 2 * n + j
+    other = (i + ~upper) * 2 * n + j + 1
+    return one.ravel(), other.ravel(), np.where(upper, -1.0, 1.0).ravel()
 
 
 def _segments(samples: FloatArray, rows: IntArray, length: int) -> FloatArray:
