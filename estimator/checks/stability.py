@@ -60,6 +60,8 @@ SECOND_ORDER = 4.0
 in changes: the share of its statistic that may look like changes of other sensors."""
 LEAST_OF = 0.1
 """Noise that changes of a sensor explain, over the most of any sensor, from which it is named."""
+ALIKE_BESIDE = 0.4
+"""Correlation of neighbouring frequencies, from which every second one tells nearly all of both."""
 ALIKE = 0.25
 """What a gain or a turn adds, over what the median of the bands that show a change have, from which
 it is a gain or a turn: the response changes otherwise, at some frequencies."""
@@ -372,6 +374,9 @@ def stability(
     )
     some, whole = ([e[inside[parts.bins[e]]] for inside in insides] for e in (places, every))
     is_weak = [not doubtful and is_weak_motion(maximum.take(parts.bins[each])) for each in whole]
+    step = float(frequency[1] - frequency[0])
+    if len(neighbours) and neighbours[0] > ALIKE_BESIDE:
+        some = [e[:: 1 + _are_close(frequency[parts.bins[e]], step)] for e in some]
     bands = of_bands(maximum, [e[:0] if weak else e for e, weak in zip(some, is_weak, strict=True)])
     for number in np.flatnonzero(is_weak).tolist():
         bands[number] = beside_weak_motion(of_bands, parts, maximum, whole[number], psd)
@@ -452,6 +457,12 @@ def stability(
         loudness=loudness,
         steadied=() if without is None else (without,),
     )
+
+
+def _are_close(frequency: FloatArray, step: float) -> bool:
+    """Return whether enough frequencies for half of them are mostly neighbours."""
+    few = len(frequency) < 2 * FREQUENCIES
+    return not few and float(np.ptp(frequency)) < 1.5 * step * len(frequency)
 
 
 def _usual_noise(maximum: Maximum, insides: Sequence[BoolArray]) -> list[FloatArray]:
