@@ -13,7 +13,7 @@ from daq.bench.sensitivity import joined
 from daq.bench.units import canonical
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.estimation.contributions import left_by_changes, with_contributions
-from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis
+from daq.estimation.diagnosis import Findings, bias_of_clocks, diagnosis, steadiness
 from daq.estimation.equalisation import Equalisation
 from daq.estimation.noise_estimates import (
     in_units,
@@ -127,10 +127,10 @@ class Estimator:
                 single = kept.values() / np.where(response == 0, np.nan, response)
             place_of = np.searchsorted(bins, kept.bins)
             course = SegmentCourse(single, place_of, at, np.zeros(len(at), np.int64))
-        found, _ = diagnosis((band,), self.dims, self.channels, course=course)
-        if found is None or found.stability is None:
+        found = steadiness(band, self.dims, course)
+        if found is None:
             return unknown
-        share = left_by_changes(replace(found.stability, steadied=()), frequency)
+        share = left_by_changes(replace(found, steadied=()), frequency)
         nearest = np.searchsorted(bins, np.arange(len(unknown)))
         return np.asarray(share[np.minimum(nearest, len(bins) - 1)])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import field, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
     Synchronisation,
 )
+from estimator.checks import diagnose as checks
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, SharedNoise
@@ -419,6 +421,24 @@ def diagnosis(
     )
     tested = any(np.isfinite(band.test.p_value) for band in whole.bands)
     return whole, None if tested else found[-1].untested or Untested.SINGULAR
+
+
+def steadiness(band: Band, dims: tuple[int, ...], course: SegmentCourse | None) -> Stability | None:
+    """Return the stability that `diagnosis` finds of averages in parts, where it finds one."""
+    count = _n_known(band)
+    if band.n_effective < MIN_AVERAGES or band.parts is None:
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"), suppress(InsufficientDataError):
+        return checks.steadiness(
+            band.csm[:count],
+            band.frequencies[:count],
+            dims=dims,
+            n_effective=band.n_effective,
+            neighbours=neighbours(band),
+            parts=band.parts,
+            course=course,
+        )
+    return None
 
 
 def _counts(

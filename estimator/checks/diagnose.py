@@ -289,18 +289,18 @@ def diagnose(
         tested = _fit(part, frequency, there, q, n_effective=n_effective, maxima=maxima)
     between = HANN_HALF if neighbours is None else neighbours
     insides = _insides(frequency)
-    model, untested = _test(tested, there, n_effective, len(csm))
-    model, widened, lines = beside_matrices(
-        model,
+    model, untested, widened, lines, tested, steady = _tested(
+        tested,
         part,
         frequency,
         insides,
-        dims=there.dims,
-        n_factors=q,
+        there=there,
+        n_channels=sum(dims),
         n_effective=n_effective,
         neighbours=between,
+        course=course,
+        parts=parts,
     )
-    tested = _without_lines(tested, lines)
     condition = _conditions(part.matrix, there, pairs, given.valid)
     snr, lost = _strength(fit, there, (len(csm), sum(dims)), n_effective)
     canonical = CanonicalCoherence(part.matrix, part.valid & (frequency > 0))
@@ -320,28 +320,13 @@ def diagnose(
         )
         for inside in insides
     )
-    shared, steady, left = None, None, frozenset[int]()
-    if course is not None:
-        course = replace(course, spectra=course.spectra[:, :, list(there.channels)])
-        if any(may_have_moved(each.shared) for each in found):
-            gone = moved(course.spectra, there.dims, n_effective)
-            left = frozenset(there.sensors[sensor] for sensor in gone)
-            found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
+    shared, left = None, frozenset[int]()
+    if course is not None and any(may_have_moved(each.shared) for each in found):
+        gone = moved(_there(course, there).spectra, there.dims, n_effective)
+        left = frozenset(there.sensors[sensor] for sensor in gone)
+        found = tuple(replace(b, shared=_without(b.shared, left)) for b in found)
     if isinstance(tested, Maximum) and q >= d:
-        if parts is not None and parts.each:
-            steady = stability(
-                course,
-                parts.of_channels(there.channels),
-                tested,
-                frequency,
-                insides,
-                psd=part.psd,
-                dims=there.dims,
-                n_effective=n_effective,
-                neighbours=between,
-            )
         if steady is not None:
-            steady = steady.among(there.channels, there.sensors, sum(dims))
             found = tuple(
                 replace(b, test=_allowed(b.test, by))
                 for b, by in zip(found, steady.inflations.tolist(), strict=True)
@@ -390,10 +375,94 @@ def diagnose(
     )
 
 
-def _without_lines(fit: Maximum | Untested, lines: IntArray) -> Maximum | Untested:
+def steadiness(
+    csm: ComplexArray,
+    frequency: FloatArray,
+    *,
+    dims: tuple[int, ...],
+    n_effective: float,
+    neighbours: FloatArray,
+    parts: Parts,
+    course: SegmentCourse | None,
+) -> Stability | None:
+    """Return the stability that `diagnose` finds of a test, and no more.
+
+    Parameters and errors are those of `diagnose`.
+    """
+    given = coherency(np.asarray(csm, np.complex128), dims)
+    there = presence(given, dims)
+    part, q = given.part(list(there.channels)), max(there.dims, default=max(dims))
+    return _tested(
+        _fit(part, frequency, there, q, n_effective=n_effective, maxima=Maxima()),
+        part,
+        frequency,
+        _insides(frequency),
+        there=there,
+        n_channels=sum(dims),
+        n_effective=n_effective,
+        neighbours=neighbours,
+        parts=parts,
+        course=course,
+    )[-1]
+
+
+def _tested(
+    fit: Maximum | Untested,
+    part: Coherency,
+    frequency: FloatArray,
+    insides: Sequence[BoolArray],
+    *,
+    there: PresentSensors,
+    n_channels: int,
+    n_effective: float,
+    neighbours: FloatArray,
+    parts: Parts | None,
+    course: SegmentCourse | None,
+) -> tuple[ModelTest, Untested | None, BoolArray, IntArray, Maximum | Untested, Stability | None]:
+    """Return the test of a fit, why there is none, and what else `beside_matrices` returns of it.
+
+    With the fit without lines, and the stability by it if it has enough dimensions; dead channels
+    are counted there.
+    """
+    model, untested = _test(fit, there, n_effective, len(frequency))
+    if isinstance(fit, Untested):
+        lines = np.full(len(frequency), -1)
+        return model, untested, np.zeros(len(insides), np.bool_), lines, fit, None
+    model, widened, lines = beside_matrices(
+        model,
+        part,
+        frequency,
+        insides,
+        dims=there.dims,
+        n_factors=fit.n_factors,
+        n_effective=n_effective,
+        neighbours=neighbours,
+    )
+    fit, steady = _without_lines(fit, lines), None
+    if parts is not None and parts.each and fit.n_factors >= max(there.dims):
+        steady = stability(
+            None if course is None else _there(course, there),
+            parts.of_channels(there.channels),
+            fit,
+            frequency,
+            insides,
+            psd=part.psd,
+            dims=there.dims,
+            n_effective=n_effective,
+            neighbours=neighbours,
+        )
+    if steady is not None:
+        steady = steady.among(there.channels, there.sensors, n_channels)
+    return model, untested, widened, lines, fit, steady
+
+
+def _there(course: SegmentCourse, there: PresentSensors) -> SegmentCourse:
+    """Return segments without dead channels."""
+    return replace(course, spectra=course.spectra[:, :, list(there.channels)])
+
+
+def _without_lines(fit: Maximum, lines: IntArray) -> Maximum:
     """Return a fit in which frequencies with lines of a sensor say nothing."""
-    if isinstance(fit, Untested) or not (lines >= 0).any():
-        return fit
     return replace(fit, converged=fit.converged & (lines < 0))
 
 
