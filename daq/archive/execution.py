@@ -29,8 +29,8 @@ from daq.archive.task import Outcome, Task, run, software_version
 from daq.errors import ArchiveError, HuddleError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.formats.foreign_sensor import FIRST_DATE_NS
 from daq.python_process import python_command
+from daq.recording.interface import FIRST_DATE_NS
 from daq.recording.reader import Recording
 
 _LOGGER = logging.getLogger(__name__)

@@ -15,8 +15,7 @@ from daq.clocks.aligned_recording import AlignedRecording
 from daq.errors import CannotAlignError, RecordingError, WrongSettingError
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
-from daq.formats.foreign_sensor import FIRST_DATE_NS
-from daq.recording.interface import ReadableRecording
+from daq.recording.interface import FIRST_DATE_NS, ReadableRecording
 from daq.recording.reader import Recording
 from daq.recording.storage.locking import is_being_written
 from daq.recording.storage.names import continuation_names

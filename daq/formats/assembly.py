@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 from daq.clocks.resampling import reach, resample
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import (
-    FIRST_DATE_NS,
     NS_PER_S,
     ForeignSensor,
     Stretch,
     piecewise_linear,
 )
 from daq.formats.traces import PartCache, Piece
+from daq.recording.interface import FIRST_DATE_NS
 
 Overlap: TypeAlias = Literal["refuse", "first", "last"]
 

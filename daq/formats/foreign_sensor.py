@@ -14,13 +14,12 @@ from daq.bench.channel import Channel, check_name
 from daq.bench.units import canonical
 from daq.errors import ImportFormatError
 from daq.protocols.block import CountsArray
+from daq.recording.interface import FIRST_DATE_NS
 
 NS_PER_S = 1_000_000_000
 MAX_CHANNELS = 1000
 MIN_RATE, MAX_RATE = 1e-6, 1e7
 """In Hz."""
-FIRST_DATE_NS = 10**17
-"""Times before March 1973 are those of files without a date."""
 
 
 class RowSource(Protocol):

@@ -17,13 +17,14 @@ from typing import TypeAlias
 
 from daq.errors import ImportFormatError
 from daq.formats.assembly import SAME_RATE, Overlap, assembled
-from daq.formats.foreign_sensor import FIRST_DATE_NS, NS_PER_S, ForeignCalibration, ForeignSensor
+from daq.formats.foreign_sensor import NS_PER_S, ForeignCalibration, ForeignSensor
 from daq.formats.readers.delimited import read_delimited
 from daq.formats.readers.miniseed import is_miniseed, miniseed_parts
 from daq.formats.readers.npz import read_mat, read_npz
 from daq.formats.readers.vibration import read_uff, read_wav, tdms_parts
 from daq.formats.readers.waveforms import waveform_part
 from daq.formats.traces import PartCache, Piece, ReadPart, TracePart, pieces_of, traces_of
+from daq.recording.interface import FIRST_DATE_NS
 
 Progress: TypeAlias = Callable[[str], None]
 WholeFile: TypeAlias = Callable[[Path, float | None], Sequence[ForeignSensor]]

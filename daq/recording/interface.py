@@ -15,6 +15,9 @@ from daq.bench.outline import BenchOutline
 from daq.caveats import Caveats
 from daq.protocols.block import Event, HostTime, Reading
 
+FIRST_DATE_NS = 10**17
+"""Times before March 1973 are those of files without a date."""
+
 
 class ReadableBlocks(Protocol):
     """Blocks of one sensor, dtype `daq.recording.file_format.BLOCK_DTYPE`; indexed as an array."""

@@ -54,13 +54,13 @@ from numpy.typing import NDArray
 
 from daq.errors import ImportFormatError
 from daq.formats.foreign_sensor import (
-    FIRST_DATE_NS,
     MAX_CHANNELS,
     NS_PER_S,
     ForeignSensor,
     Stretch,
     finite_stretches,
 )
+from daq.recording.interface import FIRST_DATE_NS
 
 _HEAD_BYTES = 1 << 16
 _HEAD_LINES = 400

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from daq.caveats import Caveat
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import SensorTotals, Snapshot
-from daq.formats.foreign_sensor import FIRST_DATE_NS
+from daq.recording.interface import FIRST_DATE_NS
 from daq.recording.monitor import RecordingStatus
 from daq.recording.sensor_state import SensorState
 from daq.results.facts.fact import Fact
