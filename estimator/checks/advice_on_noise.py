@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import field
 
 from estimator.checks.advice import Advice, Names, Rank
-from estimator.records import Hertz, Seconds, Share
+from estimator.records import NOT_IN_JSON, Hertz, Seconds, Share
 from estimator.wording import Words, few, listed, percent, ratio, several, time_of_day
 
 LARGE_FALL = -0.8
@@ -151,6 +152,8 @@ class NoiseChanges(Advice):
     n_parts : int
     inflation : float
         Correction of the model test and the tests of shared noise.
+    is_own : bool
+        Whether it changes of this sensor alone, where the model test passes.
     """
 
     channel: int
@@ -158,6 +161,7 @@ class NoiseChanges(Advice):
     expected: Share
     n_parts: int
     inflation: float
+    is_own: bool = field(default=False, metadata=NOT_IN_JSON)
 
     def _words(self, names: Names) -> Words:
         intervals = (

@@ -52,6 +52,7 @@ from estimator.likelihood.goodness_of_fit import (
     model_test,
     p_values,
     pool,
+    rejected_below,
 )
 from estimator.likelihood.maximum_likelihood import standard_error
 from estimator.median import median_of_columns
@@ -81,10 +82,15 @@ LEAST_KNOWN = 0.2
 """Standard error of a part's noise, as a fraction, up to which changes are reported."""
 LARGE = 0.5
 SMALL = 0.05
+ALONE = 0.08
+"""Changes of the noise of others over those of a sensor, squared, below which it changes alone."""
 
 
 def changes(
-    stability: Stability | None, course: SegmentCourse | None, sensor_of: IntArray
+    stability: Stability | None,
+    course: SegmentCourse | None,
+    sensor_of: IntArray,
+    bands: Sequence[BandDiagnosis] = (),
 ) -> Iterator[Advice]:
     """Yield advice on changing responses, and on disturbed segments or else on changing noise.
 
@@ -96,6 +102,8 @@ def changes(
     course : SegmentCourse or None
         None where no segment is disturbed.
     sensor_of : int64, shape (n_channels,)
+    bands : sequence of BandDiagnosis
+        Of which the model test tells where motion may seem to be noise that changes.
     """
     if stability is None:
         return
@@ -129,7 +137,10 @@ def changes(
         if not stability.is_restless:
             return
     found = stability.parts
-    more = np.sqrt(np.maximum(found.deviation**2 - found.expected**2, 0.0))
+    squares = found.deviation**2 - found.expected**2
+    more = np.sqrt(np.maximum(squares, 0.0))
+    rejected = rejected_below(band.test for band in bands)
+    passes = np.array([band.test.p_value >= rejected for band in bands], np.bool_)
     tested = int(np.isfinite(found.statistic).sum())
     if not tested:
         return
@@ -151,7 +162,23 @@ def changes(
             expected=float(found.expected[group, channel]),
             n_parts=found.n_parts,
             inflation=float(stability.inflations[group]),
+            is_own=_is_own(squares, sensor_of == sensor_of[channel], passes, group),
         )
+
+
+def _is_own(squares: FloatArray, own: BoolArray, passes: BoolArray, group: int) -> bool:
+    """Return whether noise changes of one sensor alone, in bands that pass the model test.
+
+    Motion that the model lacks is felt by several. `squares`, (n_bands, n_channels), are those of
+    changes of the noise, of which the bands around `group` that pass are averaged.
+    """
+    if not len(passes) or not passes[group]:
+        return False
+    failed = np.flatnonzero(~passes)
+    low = failed[failed < group].max(initial=-1) + 1
+    high = failed[failed > group].min(initial=len(passes))
+    power = np.nan_to_num(squares[low:high]).mean(axis=0)
+    return bool(power[~own].max() < ALONE * power[own].max())
 
 
 LOST = 0.5
@@ -368,7 +395,7 @@ def diagnose(
             moved=left,
             further=(
                 *_lines(lines, frequency, there.sensors),
-                *changes(steady, course, np.repeat(np.arange(len(dims)), dims)),
+                *changes(steady, course, np.repeat(np.arange(len(dims)), dims), found),
             ),
         ),
         stability=steady,

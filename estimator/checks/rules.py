@@ -211,13 +211,17 @@ def advise(
         *_absent(given, dims),
         *(each for each in further if not isinstance(each, NoiseChanges)),
         # motion that the model lacks is noise to parts of time, and changes as motion does; so
-        # where it fails on both sides
+        # where it fails on both sides, unless one sensor alone changes
         *islice(
             (
                 each
                 for each in further
                 if isinstance(each, NoiseChanges)
-                and (not failed or (each.band is not None and not _within(each.band, low, high)))
+                and (
+                    not failed
+                    or each.is_own
+                    or (each.band is not None and not _within(each.band, low, high))
+                )
             ),
             1,
         ),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
 import huddle
@@ -16,6 +17,7 @@ from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.calibration import calibrate
 from daq.results.result import Result
+from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges, ResponseChanges
 from tests.acceptance.broken_assumptions import one
 
@@ -322,3 +324,24 @@ def test_too_few_averages_to_test_for_changes_are_a_fact(segment: str, *, is_tes
     found = huddle.self_noise(samples, fs=RATE, segment=segment)
     names = [each.name for each in found.result.facts]
     assert ("steadiness-not-tested" not in names) == is_tested
+
+
+def test_noise_that_changes_between_bands_that_fail_is_named() -> None:
+    """Other axes below 1.2 and above 5 Hz; the noise of A.X alone steps between them."""
+    samples, n = recorded("", 3, ratio=100, n=N), N
+    rng = np.random.default_rng(3)
+
+    def band(low: float, high: float, n_channels: int) -> np.ndarray:
+        some = butter(6, (low, high), "bandpass", fs=RATE, output="sos")
+        return np.asarray(sosfilt(some, rng.standard_normal((n, n_channels)), axis=0))
+
+    others = band(0.3, 1.2, 3) + band(5.0, 9.0, 3)
+    for name in samples:
+        samples[name] += others @ rng.standard_normal((3, 3))
+    samples["A"][:, 0] += 1.3 * band(1.6, 4.0, 1)[:, 0] * (np.arange(n) > n / 2)
+    advice = huddle.self_noise(samples, fs=RATE).snapshot.diagnostics.advice
+    assert {e.band for e in advice if isinstance(e, ModelMisfit)} == {(0.0, 1.5), (4.1, 10.0)}
+    (change,) = [each for each in advice if isinstance(each, NoiseChanges)]
+    assert change.channel == 0
+    assert change.band is not None
+    assert 1.5 < change.band[0] < change.band[1] < 4.1
