@@ -400,8 +400,9 @@ class Equalisation:
             window = get_window(band.settings.window, band.settings.segment_length)
             rate, n_effective = band.settings.sampling_rate, band.n_effective
             responses = channel_responses(csm, band.frequencies, dims=self._dims)
+            hidden = np.zeros(noise.shape, np.bool_)
             if self._jumps:
-                left, deviation = responses.leakage_from_afar(
+                left, deviation, hidden = responses.leakage_from_afar(
                     motion, window, rate, n_effective=n_effective
                 )
             else:
@@ -412,6 +413,8 @@ class Equalisation:
             share, deviation = band_shares(left, deviation, np.abs(noise), band.frequencies)
             left = np.where(share > _SEEN * deviation, left, 0.0)  # the rest is scatter
             least = significant_minimum(share, deviation, band.frequencies)
+            # where responses differ, what leaks from lines that are hidden may be all of the noise
+            left = np.where(hidden & (least > 0).any(axis=0), np.fmax(left, np.abs(noise)), left)
             parts.append((motion, left, least))
         return _Leaks(noise_of_bands, *map(np.concatenate, zip(*parts, strict=True)))
 

@@ -29,6 +29,7 @@ from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 MIN_COHERENCE = 0.3
 """Minimum coherence between a channel and its prediction at a used frequency."""
 _LEAST_OWN = 0.1  # of the power of a line, below which all has leaked from others
+_MOST_LEAKED = 0.5  # of the power of a line, below which its response is not seen
 _FEIGNED = 0.46  # leakage that the error of responses feigns, over its power; it scatters twice so
 _TWO_FREQUENCIES = 1.67  # 2 (1 - 1/6): variance of a difference two bins apart under Hann
 _CORRELATED = 2.0  # variance of a sum over that of independent frequencies
@@ -145,11 +146,12 @@ class ChannelResponses:
         sampling_rate: float,
         *,
         n_effective: float,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return `leakage` under a window that jumps at its ends, and its standard deviation.
 
-        Motion then leaks from all frequencies, and slopes do not tell by how much responses differ
-        there. Between the lines of the spectrum responses are interpolated.
+        And where most of a line is leakage. Motion then leaks from all frequencies, and slopes do
+        not tell by how much responses differ there. Between the lines of the spectrum responses are
+        interpolated.
 
         Parameters
         ----------
@@ -164,6 +166,8 @@ class ChannelResponses:
         -------
         leakage, deviation : float64, shape (n_freqs, n_channels)
             Without what the noise of the averages feigns.
+        hidden : bool, shape (n_freqs, n_channels)
+            Lines of which most has leaked from others: their own response is not seen.
 
         Notes
         -----
@@ -183,6 +187,7 @@ class ChannelResponses:
             return np.asarray(np.fft.rfft(course)[:, 2 * lines].reshape(density.shape))
 
         leakage, feigned = np.zeros((2, *motion_psd.shape))
+        hidden = np.zeros(motion_psd.shape, np.bool_)
         for channel, found in enumerate(np.nan_to_num(motion_psd).T):
             sensors = np.flatnonzero((self.coherence[:, channel] > MIN_COHERENCE).any(axis=0))
             if len(sensors) < 2:
@@ -196,6 +201,7 @@ class ChannelResponses:
             # responses and power without what has leaked to a line from others
             own, crossed = (2 * each - averaged(each) for each in (power, power * g.conj()))
             there = own.real > _LEAST_OWN * power
+            hidden[:, channel] = usable & (own.real < _MOST_LEAKED * power)
             own = np.where(there, own.real, 0.0)
             g = np.where(there, crossed.conj() / np.where(there, own, 1.0), 0.0)
             error *= np.where(there, power / np.where(there, own, 1.0), 1.0)
@@ -207,7 +213,7 @@ class ChannelResponses:
                     left = (whole - by[k] * by[j].conj() / between).real
                 leakage[:, channel] += np.nan_to_num(left) / len(pairs)
                 feigned[:, channel] += _FEIGNED * power * error[j] * error[k] / len(pairs)
-        return leakage - feigned, 2 * feigned
+        return leakage - feigned, 2 * feigned, hidden
 
     def _of_pairs(self, n_effective: float) -> tuple[FloatArray, FloatArray]:
         """Return the mean of products of slopes over pairs of sensors, and its deviation."""

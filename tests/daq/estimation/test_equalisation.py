@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import butter, lfilter
 
+import huddle
 from benchmarks.studies.synthesis import synthesise
 from daq.bench.response import Fir, Measured, PolesZeros, Response
 from daq.estimation import equalisation, noise_estimates
 from daq.estimation.estimation import Estimation, estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
+from daq.results.result import Result
 from estimator.checks.advice_on_sensors import Delay, UnequalResponses
 from estimator.methods import self_noise
 from estimator.self_noise.result import SelfNoise
@@ -319,3 +322,20 @@ def test_rectangular_windows_do_not_make_equal_sensors_differ(tmp_path: Path) ->
     assert edges is not None
     inside = (snapshot.frequency > 4) & (snapshot.frequency < 88)
     assert edges.most[inside].mean() < 0.05 * 2 * 100.0**2 / 200.0
+
+
+def test_noise_at_lines_that_have_leaked_is_at_most_what_is_found() -> None:
+    """Red motion, rectangular windows, a low pass in A: three times its noise, known to 20 %."""
+    rng = np.random.default_rng(20)
+    motion = lfilter(*butter(2, 0.6, fs=100.0), rng.standard_normal((26_000, 3)), axis=0)
+    samples = {}
+    for name in "ABC":
+        felt = 5 * 10**2.5 * motion @ np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        felt = lfilter(*butter(1, 30.0, fs=100.0), felt, axis=0) if name == "A" else felt
+        samples[name] = felt[2000:] + rng.standard_normal((24_000, 3))
+    snapshot = huddle.self_noise(
+        samples, fs=100.0, segment="10s", window="rectangular", overlap=0.0
+    ).snapshot
+    for column, mean in enumerate(Result(snapshot, Settings()).means("three-sensor", (4.0, 14.0))):
+        assert mean.high[0] > 0.02
+        assert (mean.mean[0] > 0.04) == (mean.low[0] < 0) == (column < 3)

@@ -72,7 +72,7 @@ def predicted_by_a_rectangular_window(response: np.ndarray) -> np.ndarray:
     csm = SNR * loading[:, :, None] * loading[:, None].conj() + np.eye(3)
     motion = SNR * np.abs(loading) ** 2
     found = channel_responses(csm, FREQUENCY, dims=(1, 1, 1))
-    leakage, _ = found.leakage_from_afar(motion, np.ones(2000), 200.0, n_effective=24.0)
+    leakage, *_ = found.leakage_from_afar(motion, np.ones(2000), 200.0, n_effective=24.0)
     return leakage
 
 
