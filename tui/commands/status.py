@@ -34,7 +34,8 @@ def status(path: Path, *, json: str | None = None) -> None:
     try:
         bench = load(path)
     except BenchFileError:
-        notices().print("a running service goes on with the bench file that it accepted before")
+        if path.is_file():
+            notices().print("a running service goes on with the bench file that it accepted before")
         raise
     runs = RunStore(bench.recording_directory).current(bench.name)
     bench.recording_directory.mkdir(parents=True, exist_ok=True)
