@@ -60,6 +60,8 @@ FOLDED = (0.6, 1.6), 30
 and their number at least: its distribution is level there; that of others falls, or rises."""
 DISTINCT_CODES = 32
 """Codes without which nothing can be said of their bits."""
+OUTER, FEW = 0.1, 1024
+"""Share of samples on each side that do not tell of bits; samples that tell where these are."""
 MIN_PERIODS = 4, 16
 """Periods of a bit within the range, and those of many that the signal takes: a signal that rests
 at some levels takes few."""
@@ -154,11 +156,8 @@ class CountLimits:
                 values[n] = counts[known, n] if not known.all() else counts[:, n].copy()
             every &= known
         wrapped = {n: found for n, own in values.items() if (found := wraps(own)) is not None}
-        ordered = {n: np.sort(own) for n, own in values.items()}
-        clipped = {
-            n: share for n, own in values.items() if (share := share_at_ends(own, ordered[n]))
-        }
-        of_codes = {n: codes(own) for n, own in ordered.items()}
+        clipped = {n: share for n, own in values.items() if (share := share_at_ends(own))}
+        of_codes = {n: codes(own) for n, own in values.items() if not _takes_all_bits(own)}
         together = counts if every.all() else counts[every]
         share = share_of_repeats(together[:, list(columns)]) if columns else 0.0
         return cls(
@@ -208,35 +207,26 @@ class CountLimits:
         return CountLimits(clipped, wrapped, repeated, codes)
 
 
-def share_at_ends(counts: NDArray[Any], ordered: NDArray[Any] | None = None) -> float:
+def share_at_ends(counts: NDArray[Any]) -> float:
     """Return the share of samples at the ends of the range of one channel, 0 if not clipped.
 
     Parameters
     ----------
     counts : ndarray, shape (n_samples,)
         In the order of time.
-    ordered : ndarray, shape (n_samples,), optional
-        The same, ascending.
     """
     if len(counts) < MIN_AT_END:
         return 0.0
-    ordered = np.sort(counts) if ordered is None else ordered
-    if any(np.ptp(end) == 0 for end in (ordered[:MIN_AT_END], ordered[-MIN_AT_END:])):
-        values, times = _distinct(ordered)
+    if any(np.count_nonzero(counts == end) >= MIN_AT_END for end in (counts.min(), counts.max())):
+        values, times = _distinct(np.sort(counts))
         if len(values) < DISTINCT:
             return 0.0
         ends = ((times[0], times[1:BESIDE].max()), (times[-1], times[-BESIDE:-1].max()))
         cut = [int(end) for end, beside in ends if end >= max(MIN_AT_END, TIMES * beside)]
         if cut and _has_slopes(values, times, sum(cut)):
             return sum(cut) / len(counts)
-    signal, ordered = counts.astype(np.float64), ordered.astype(np.float64)
-    steps = np.diff(ordered)
-    unit = float(steps[steps > 0].min(initial=math.inf))
-    middle = float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
-    return sum(
-        max(_at_soft_end(*each, parts, unit, side * middle) for parts in WIDTHS)
-        for side, each in ((1, (signal, ordered)), (-1, (-signal, -ordered[::-1])))
-    )
+    signal = counts.astype(np.float64)
+    return sum(max(_at_soft_end(own, parts) for parts in WIDTHS) for own in (signal, -signal))
 
 
 def _distinct(ordered: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
@@ -253,23 +243,23 @@ def _has_slopes(values: NDArray[Any], times: NDArray[np.int64], n_cut: int) -> b
     return int(times[inner].sum()) >= MIN_ON_SLOPES * n_cut
 
 
-def _at_soft_end(
-    values: FloatArray, ordered: FloatArray, parts: int, unit: float, middle: float
-) -> float:
-    """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped.
-
-    `ordered` are the same values, ascending, `unit` is their least distance, `middle` the median.
-    """
-    top = ordered[-1]
-    width = (top - ordered[0]) / parts
-    if width < 2 * unit:
+def _at_soft_end(values: FloatArray, parts: int) -> float:
+    """Return the share of values in the uppermost of ``parts`` of the range; 0 if not clipped."""
+    top = values.max()
+    width = (top - values.min()) / parts
+    if not width:
         return 0.0
-    near = ordered[np.searchsorted(ordered, top - (max(SLOPES * parts, BESIDE) + 1) * width) :]
+    near = values[values >= top - (max(SLOPES * parts, BESIDE) + 1) * width]
     below = np.bincount(np.minimum((top - near) / width, parts - 1).astype(np.int64))
     n_end, n_near = int(below[0]), int(below[1 : int(SLOPES * parts)].sum())
     few = n_end < max(MIN_REPEATS, float(TIMES * below[1:BESIDE].max(initial=0)))
     if few or n_end > AT_SOFT_END * len(values) or n_near < MIN_ON_SLOPES * n_end:
         return 0.0
+    ordered = np.sort(values)
+    steps = np.diff(ordered)
+    if width < 2 * steps[steps > 0].min():
+        return 0.0
+    middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
     at_end = values > top - width
     sides = at_end[at_end | (values < middle)]
     visits = np.count_nonzero(np.diff(sides.astype(np.int8)) == 1) + int(sides[0])
@@ -340,7 +330,7 @@ def codes(counts: NDArray[Any]) -> Codes | None:
     whole = _whole(counts)
     if whole is None or not len(whole):
         return None
-    values, times = _distinct(np.sort(whole, kind="stable"))  # fast where they are sorted
+    values, times = _distinct(np.sort(whole))
     if len(values) < DISTINCT_CODES:
         return None
     steps = np.diff(values)
@@ -352,10 +342,25 @@ def codes(counts: NDArray[Any]) -> Codes | None:
     return Codes(step, stuck, n_missing, math.log2(span) - len(stuck))
 
 
+def _takes_all_bits(counts: NDArray[Any]) -> bool:
+    """Return whether `codes` would be complete, by less than all: where the range is wide."""
+    whole = _whole(counts)
+    if whole is None or not len(whole) or (span := int(np.ptp(whole))) < len(whole):
+        return False  # each code may have many samples
+    few = np.sort(whole[:: -(-len(whole) // FEW)])
+    low, high = few[len(few) // 5], few[-1 - len(few) // 5]
+    if min((whole < low).mean(), (whole > high).mean()) <= OUTER:
+        return False
+    inner = whole[(whole >= low) & (whole <= high)]
+    changing = int(np.bitwise_or.reduce(inner)) ^ int(np.bitwise_and.reduce(inner))
+    passed = (1 << max(span.bit_length() - 3, 1)) - 2  # bits of `MIN_PERIODS` but the first
+    return int(np.gcd.reduce(inner[:FEW] - inner[0])) == 1 and not passed & ~changing
+
+
 def _stuck_bits(values: NDArray[np.int64], times: NDArray[np.int64], step: int) -> list[int]:
     """Return bits above the step that are constant while the signal passes their periods."""
     share = np.cumsum(times) / times.sum()
-    inner = values[(share > 0.1) & (share < 0.9)]
+    inner = values[(share > OUTER) & (share < 1 - OUTER)]
     if len(inner) < DISTINCT_CODES:
         return []
     span, bit, found = int(inner[-1] - inner[0]), step.bit_length(), []
