@@ -113,8 +113,8 @@ def segment_findings(
     own = np.einsum("fpp->fp", residuals.projector).real
     gains, powers, felt = SegmentGains(own, course.bins[there], groups, dims), [], []
     for residual, motion in residuals:
-        powers.append((np.abs(residual) ** 2).sum(axis=1))
-        felt.append((np.abs(motion) ** 2).sum(axis=(1, 2)))
+        powers.append(np.einsum("sfp->sp", np.abs(residual) ** 2))  # faster than a sum
+        felt.append(np.einsum("sfp->s", np.abs(motion) ** 2))
         gains.add(residual, motion)
     part = np.searchsorted(begin, course.times, side="right")
     found = replace(none, gains=gains.unsteady(part))
@@ -191,20 +191,17 @@ class _Residuals:
         share = (np.abs(at.eigenvectors) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
         self._fitted = np.einsum("fpp->fp", at.rest).real + share
         self.projector = at.projector
-        self.n_channels = at.psi.shape[1]
 
     def __iter__(self) -> Iterator[tuple[ComplexArray, ComplexArray]]:
         """Yield residuals and motion of each group, (n_segments, n_freqs, n_channels) each."""
         for group in self._groups:
-            shape = (len(self._spectra), len(group), self.n_channels)
-            residual, felt = np.empty((2, *shape), np.complex128)
-            for place, number in enumerate(group.tolist()):
-                x = self._spectra[:, self._columns[number]].astype(np.complex128)
-                x *= np.sqrt(self._fitted[number] / np.mean(np.abs(x) ** 2, axis=0))
-                motion = self._motion[number]
-                felt[:, place] = x @ motion.conj() @ motion.T
-                residual[:, place] = x - felt[:, place]
-            yield residual, felt
+            x = self._spectra[:, self._columns[group]].swapaxes(0, 1).astype(np.complex128, "C")
+            power = np.einsum("fsp->fp", np.abs(x) ** 2) / x.shape[1]
+            x *= np.sqrt(self._fitted[group] / power)[:, None]
+            motion = self._motion[group]
+            felt = x @ motion.conj() @ motion.swapaxes(1, 2)
+            x -= felt
+            yield x.swapaxes(0, 1), felt.swapaxes(0, 1)
 
     def powers(self, some: BoolArray) -> FloatArray:
         """Return mean powers of the residuals over some segments, shape (n_bins, n_channels)."""

@@ -82,6 +82,8 @@ class SegmentGains:
     ) -> None:
         self._own, self._some = [own[group] for group in groups], list(_apart(bins, groups))
         self._patterns = list(_of_sensors(dims))
+        ends = zip(itertools.accumulate(dims), dims, strict=True)
+        self._sensors = [(slice(end - d, end), _signs(d)) for end, d in ends]
         self._score: list[FloatArray] = []
         self._weight: list[FloatArray] = []
 
@@ -90,15 +92,15 @@ class SegmentGains:
         some, own = self._some[len(self._score)], self._own[len(self._score)]
         residual, motion, own = residual[:, some], motion[:, some], own[some]
         power = motion.real**2 + motion.imag**2
-        score, weight = np.zeros((2, len(self._patterns), len(residual)))
-        for number, pattern in enumerate(self._patterns):
-            for a, b, sign in pattern.pairs:
-                one, other = residual[..., a], motion[..., b]
-                along = one.real * other.real + one.imag * other.imag
-                score[number] += sign * along.sum(axis=1)
-                weight[number] += power[..., b] @ own[:, a]
-        self._score.append(score.T)
-        self._weight.append(weight.T)
+        score, weight = [], []
+        for c, signs in self._sensors:
+            of_both = [residual[..., c], motion[..., c]]
+            R, M = (np.concatenate([each.real, each.imag], axis=1) for each in of_both)
+            score.append((R.swapaxes(1, 2) @ M).reshape(-1, len(signs)) @ signs)
+            known = own[:, c].T @ power[..., c]
+            weight.append(known.reshape(-1, len(signs)) @ np.abs(signs))
+        self._score.append(np.concatenate(score, axis=1))
+        self._weight.append(np.concatenate(weight, axis=1))
 
     def unsteady(self, part: IntArray) -> tuple[UnsteadyGain, ...]:
         """Return what changes within parts of time, of which `part` tells each segment's, rising.
@@ -136,6 +138,11 @@ class SegmentGains:
                 float(sure[number]),
             )
         return tuple(best.values())
+
+
+def _signs(d: int) -> FloatArray:
+    """Return the patterns of `_of_sensors` of a sensor of d channels, shape (d*d, n_patterns)."""
+    return np.concatenate([rows for _, _, rows in patterns(d)]).T
 
 
 def _apart(bins: IntArray, groups: list[IntArray]) -> Iterator[IntArray]:
