@@ -8,7 +8,7 @@ The pairs are those with which, one noise matrix for both, a dimension less expl
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import reduce
+from functools import cache, reduce
 from itertools import combinations
 from typing import Any, TypeAlias
 
@@ -36,6 +36,9 @@ CANDIDATES = 2
 EXPLAINS = 0.75
 """Share of what one more dimension explains, from which noise that two sensors share explains it.
 Motion that four equal sensors feel leaves it at a third."""
+TOGETHER = 0.85
+"""The same in all bands of a pair together. Motion alike to four sensors of unequal noise left 0.60
+to 0.77, noise that two share 0.94 and more."""
 DOUBTFUL = 1e-6
 """p value from which what pairs leave unexplained may be one more weak dimension."""
 ELSEWHERE = 2.0
@@ -135,7 +138,9 @@ class PairSearch:
         usual: int,
         level: float,
     ) -> None:
-        self._test, self._axes, self._noise, self._dims = test, axes, noise, dims
+        known = cache(lambda q, band, group: test(q, band, np.array(group)))
+        self._test: Test = lambda q, band, group: known(q, band, tuple(group.tolist()))
+        self._axes, self._noise, self._dims = axes, noise, dims
         self._usual, self._level = usual, level
         self._alone = np.arange(len(dims))
 
@@ -156,7 +161,25 @@ class PairSearch:
         for b in [b for b in tried if b not in found] if known else ():
             if its := self._as_elsewhere(min(len(tried[b]) - 1, self._usual), b, [*known]):
                 found[b] = its
-        return found
+        theirs = {pair for pair in known if self._is_theirs(pair, found)}
+        return {b: each for b, each in found.items() if theirs.issuperset(each.pairs)}
+
+    def _is_theirs(self, pair: Pair, found: Mapping[int, Sharing]) -> bool:
+        """Whether a pair explains as much as one more dimension, in all its bands together.
+
+        In single bands, weak motion may seem to be of two sensors by chance.
+        """
+        lacking = variance = 0.0
+        for band, each in found.items():
+            if pair in each.pairs:
+                others = _groups(self._alone, [other for other in each.pairs if other != pair])
+                at = self._test(each.n_factors, band, others)
+                more = self._test(each.n_factors + 1, band, others)
+                if at is not None and more is not None:
+                    total = _excess(at) - _excess(more)
+                    lacking += TOGETHER * total - _excess(at) + _excess((each.test, at[1]))
+                    variance += 2 * (at[0].degrees - each.test.degrees) * at[0].spread
+        return bool(lacking <= ELSEWHERE * np.sqrt(variance))
 
     def _sharing(self, q: int, band: int, *, any_pair: bool) -> Sharing | None:
         """Return the sensors that share noise, if that explains a band with q dimensions or fewer.

@@ -108,16 +108,28 @@ def test_motion_of_all_sensors_is_no_noise_of_two(n_sensors: int, d: int) -> Non
         assert not any(choice.pairs for choice in result.snapshot.diagnostics.dimensions)
 
 
-@pytest.mark.parametrize("seed", [1, 10])
-def test_motion_that_fades_is_no_noise_of_the_two_quietest_sensors(seed: int) -> None:
+FOUR, FIVE = (1.6, 0.45, 1.5, 0.5), (1.0, 0.12, 1.0, 0.25, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("seed", "noise", "motion"),
+    [
+        (1, FIVE, (3.0, 0.03)),
+        (10, FIVE, (3.0, 0.03)),
+        (4, FOUR, (1.0, 0.1)),
+        (13, FOUR, (1.0, 0.1)),
+    ],
+)
+def test_motion_that_fades_is_no_noise_of_the_two_quietest_sensors(
+    seed: int, noise: tuple[float, ...], motion: tuple[float, float]
+) -> None:
     """In units of the noise, most of what all feel alike is in the quietest."""
     rng = np.random.default_rng(seed)
-    dims, n = (3,) * 5, 70
+    dims, n = (3,) * len(noise), 70
     turned = np.concatenate([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in dims])
-    noise = np.repeat([1.0, 0.12, 1.0, 0.25, 0.7], 3)
     frequency = np.linspace(0.5, 50.0, 120)
-    fading = np.geomspace(3.0, 0.03, len(frequency))
-    csm = fading[:, None, None] * (turned @ turned.T) + np.diag(noise)
+    fading = np.geomspace(*motion, len(frequency))
+    csm = fading[:, None, None] * (turned @ turned.T) + np.diag(np.repeat(noise, 3))
     averages = wishart(csm.astype(np.complex128), n, rng)[0]
     _, choices = choose_dimension(
         averages, frequency, dims=dims, n_effective=n, neighbours=np.zeros(0)
