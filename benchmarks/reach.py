@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import scipy.fft
@@ -27,6 +29,7 @@ from benchmarks.estimate_file import (
 from benchmarks.row import Row, least_work
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from estimator.checks.count_limits import CountLimits
 
 LIBRARIES = "import numpy, h5py, typer, rich"
 FREE = (0.0, 15.0, -20.0)
@@ -35,6 +38,15 @@ SENSORS, MANY_RATE, MANY_HOURS = (8, 16, 32), 100, 0.5
 HOURS, DAY, DAY_RATE = 3.0, 24.0, 40
 SHORT = 0.05
 """Hours of the smallest form."""
+_UNTESTED: dict[str, object] = {
+    "estimator.checks.diagnose.stability": None,
+    "estimator.checks.diagnose.shared_noise": None,
+    "daq.estimation.snapshot_builder.nonlinear_channels": ((), ()),
+    "daq.estimation.snapshot_builder.limits_by_column": CountLimits(),
+    "daq.estimation.snapshot_builder.still_for_a_while": {},
+    "daq.estimation.equalisation.Equalisation.leakage": None,
+}
+"""Tests of what an estimate assumes, and what they find if that holds."""
 _ONLY_OWN = "import sys\nsys.modules.update(cryptography=None, lxml=None)\n"
 """Without packages that PDF reports load where they are installed, and do not need."""
 
@@ -51,17 +63,26 @@ def run(*, smallest: bool = False) -> list[Row]:
         ]
 
 
+def _untested(path: Path) -> None:
+    """Estimate without the tests of what is assumed."""
+    with ExitStack() as stack:
+        for name, found in _UNTESTED.items():
+            stack.enter_context(mock.patch(name, return_value=found))
+        estimate([path], Settings())
+
+
 def _four_minutes(folder: Path, repeats: int) -> list[Row]:
     nominal = recorded_file(folder / "nominal.h5", sensor_samples(4 / 60))
     free = recorded_file(folder / "free.h5", sensor_samples(4 / 60, ppm=FREE), ppm=FREE)
     report = ("report", str(nominal), "--out", str(folder / "report.pdf"), "--force")
-    libraries, whole, without, paper, one, three = least_work(
+    libraries, whole, without, paper, one, three, untested = least_work(
         partial(run_python, "-c", LIBRARIES),
         partial(command, nominal),
         partial(run_python, "-m", "tui", "estimate", str(nominal)),
         partial(run_python, "-m", "tui", *report),
         partial(estimate, [nominal], Settings()),
         partial(estimate, [free], Settings()),
+        partial(_untested, nominal),
         repeats=2 * repeats + 1,
     )
     memory = float(run_python("-c", _ONLY_OWN + COMMAND_MEMORY, *report).split()[-1])
@@ -75,6 +96,7 @@ def _four_minutes(folder: Path, repeats: int) -> list[Row]:
         ),
         Row("4 min: JSON of nine channels, of the command", 1 - without / whole, "", at_most=0.05),
         Row("4 min, one process: three free clocks against nominal ones", three / one, "×", 2.0),
+        Row("4 min, one process: tests of assumptions against without", one / untested, "×", 1.1),
         Row("4 min: report as PDF", paper, "s", at_most=2.5),
         Row("4 min: memory of the PDF, without lxml and cryptography", memory, "MB", at_most=150.0),
     ]
@@ -98,7 +120,7 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
         partial(csd_loop, samples, window="boxcar", noverlap=0),
         repeats=1,
     )
-    bare, hann, rectangular, unmoved, octaves, reject, three = least_work(
+    bare, hann, rectangular, unmoved, octaves, reject, three, one, untested = least_work(
         transforms,
         partial(command, moved),
         partial(command, moved, *boxcar),
@@ -106,6 +128,8 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
         partial(command, moved, "--octaves"),
         partial(command, moved, "--reject"),
         partial(estimate, [free], Settings()),
+        partial(estimate, [moved], Settings()),
+        partial(_untested, moved),
         repeats=repeats,
     )
     what = f"{hours:g} h × 9 × {RATE} Hz"
@@ -117,6 +141,7 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
         Row(f"{what}: without motion against with it", unmoved / hann, "×", at_most=1.2),
         Row(f"{what}: three free clocks against bare FFTs, imports taken off", three / bare, "×",
             at_most=9.0, note=f"{three:.2f} s"),
+        Row(f"{what}, one process: tests of assumptions against without", one / untested, "×", 1.1),
         Row(f"{what}: --octaves against the default", octaves / hann, "×", at_most=2.5),
         Row(f"{what}: --reject against the default", reject / hann, "×", at_most=1.5),
     ]  # fmt: skip
