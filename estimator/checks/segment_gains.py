@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -129,14 +130,8 @@ class SegmentGains:
         best: dict[int, UnsteadyGain] = {}
         for number in np.flatnonzero(is_seen)[np.argsort(power[is_seen])].tolist():
             own = self._patterns[number]
-            best[own.sensor] = UnsteadyGain(
-                own.sensor,
-                own.channel,
-                own.pairs,
-                own.is_turn,
-                float(variance[number]),
-                float(sure[number]),
-            )
+            known = {"variance": float(variance[number]), "sure": float(sure[number])}
+            best[own.sensor] = replace(own, **known)
         return tuple(best.values())
 
 
