@@ -17,6 +17,7 @@ from estimator.checks.advice_on_noise import SharedNoise
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.band_steadiness import ADDED
 from estimator.checks.counts import MARGIN
+from estimator.checks.diagnose import LARGE, SMALL
 from estimator.checks.stability import Stability
 from estimator.checks.steadied import MARGIN as WITHIN
 from estimator.levels.contributions import (
@@ -45,6 +46,10 @@ FEW_AVERAGES = 20.0
 """Averages up to which steadiness may not be tested beside any motion."""
 MUCH_MOTION = 10.0
 """Motion over noise from which changes of a response count."""
+SELDOM = 0.05
+"""Share of segments up to which these are disturbed, more than three: else the noise is loud."""
+DISTURBED = 2.0
+"""Share of the noise that disturbed segments may be, over that which their residuals show."""
 MOST_SHARED = 0.99
 """Part of its noise that a channel shares at most."""
 MUCH_CHANGED = 0.1
@@ -119,8 +124,9 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     found += _by_motion_that_changes(snapshot, method, psd)
     found += _changes(snapshot, psd)
     found += _contradicted(snapshot, method, tuple(found))
-    if diagnostics.faulty or _disturbed(snapshot).any():
-        found.append(_faulty(snapshot, psd))
+    by_disturbed = _by_disturbed(snapshot)
+    if diagnostics.faulty or by_disturbed.any():
+        found.append(_faulty(snapshot, psd, by_disturbed))
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
@@ -136,21 +142,23 @@ def is_untested(snapshot: Snapshot) -> bool:
     return any(bool((band.snr > MUCH_MOTION).any()) for band in found.bands)
 
 
-def _disturbed(snapshot: Snapshot) -> BoolArray:
-    """Return the channels of a sensor that was disturbed so much that it is taken for motion."""
+def _by_disturbed(snapshot: Snapshot) -> FloatArray:
+    """Return the share of the noise of each channel that disturbed segments may be."""
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
-    if steady is None or not math.isnan(steady.excess):
-        return np.zeros(len(snapshot.channels), np.bool_)
-    sensor = np.repeat(np.arange(len(snapshot.dims)), snapshot.dims)
-    return np.asarray(sensor == sensor[steady.channel])
+    n_disturbed = 0 if steady is None else len(steady.disturbed)
+    if steady is None or not 0 < n_disturbed <= max(3, SELDOM * steady.n_segments):  # else: gusts
+        return np.zeros(len(snapshot.channels))
+    more = np.nan_to_num(steady.by_disturbed, nan=math.inf)
+    share = DISTURBED * (1 - 1 / (1 + np.maximum(more, 0.0)))
+    return np.where(more > LARGE, math.inf, np.where(more > SMALL, share, 0.0))
 
 
-def _faulty(snapshot: Snapshot, psd: FloatArray) -> Contribution:
+def _faulty(snapshot: Snapshot, psd: FloatArray, by_disturbed: FloatArray) -> Contribution:
     """Return what faulty channels may be wrong by."""
     below, above = np.zeros((2, *psd.shape))
+    below += np.where(np.isinf(by_disturbed), math.inf, psd * np.fmin(by_disturbed, 1.0))
     below[:, sorted(snapshot.diagnostics.faulty)] = math.inf
-    below[:, _disturbed(snapshot)] = math.inf
     still = sorted(snapshot.diagnostics.stood_still)  # half of the time at most: its noise lacks
     above[:, still] = psd[:, still]
     return contribution(Source.FAULTY, psd.shape, below=below, above=above)

@@ -116,7 +116,7 @@ SOURCE_WORDS: Mapping[Source, str] = {
     Source.OF_MOTION: "noise that depends on the motion",
     Source.COUNTS: "rounding that channels share",
     Source.GUSTS: "noise in gusts",
-    Source.FAULTY: "a faulty channel",
+    Source.FAULTY: "a channel that is faulty or was disturbed",
     Source.SENSITIVITY: "sensitivity",
     Source.TEMPERATURE: "temperature",
 }

@@ -126,7 +126,8 @@ class DisturbedSegments(Advice):
     def _words(self, names: Names) -> Words:
         more = self.n_disturbed - len(self.times)
         times = ", ".join(f"{time:.0f} s" for time in self.times)
-        much = f"up to {percent(self.excess)} " if math.isfinite(self.excess) else ""
+        is_known = math.isfinite(self.excess) and self.excess > 0
+        much = f"up to {percent(self.excess)} " if is_known else ""
         return Words(
             f"{several(self.n_disturbed, 'disturbed segment')}, most in "
             f"{names.channels[self.channel]}: noise {much}too high; use --reject",

@@ -25,9 +25,9 @@ from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
 Samples: TypeAlias = NDArray[np.floating[Any]]
-Form: TypeAlias = Literal["curve", "product", "gain", "instants", "filled"]
+Form: TypeAlias = Literal["curve", "product", "gain", "instants", "filled", "spikes"]
 """Of what depends on the motion; "product": as that of two channels of a sensor; "filled": what is
-there where motion, or its slope, is small."""
+there where motion, or its slope, is small. Or "spikes": in single samples, as late or lost ones."""
 WIDTH = 4.0
 """Highest over lowest frequency of a band."""
 LEAST_BINS = 16
@@ -41,12 +41,15 @@ CERTAIN = 5.0
 PART = 0.4
 """Power that depends on the motion, over the most of any channel, from which a channel is named:
 a third sensor has a quarter of it in what others leave of it."""
+RARE, SPIKES = 0.003, 0.5
+"""Share of the samples with so much of the noise that these are spikes."""
 TOGETHER = 0.92
 """Evidence of all channels of a sensor, over what it were of independent ones."""
 PIECE = 24
-"""Samples of a piece, of 2.5 for each wave of the highest frequency of a band."""
-WITHIN_BAND = 4.0
-"""Power at a frequency that depends on the motion, over that in a band, at most."""
+"""Samples of a piece, of 2 to 2.5 for each wave of the highest frequency of a band."""
+MUCH, WITHIN_BAND = 0.05, 4.0
+"""Share of the residual from which all of it may depend on the motion; below, that at a frequency
+over the mean of a band, at most."""
 _LEAST = float(np.finfo(np.float32).tiny)
 _CELLS = 48  # of a curve, an eighth of a standard deviation wide
 
@@ -177,20 +180,29 @@ class _Sensor:
         squares = x**2, slope**2
         (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
         curve = of_curve = np.zeros(len(tested))
-        by_product, of_product = curve, of_curve
+        by_product, of_product, spikes = curve, of_curve, of_curve
         if is_highest:
-            x = course(motion, slice(1, None))
-            r = _left(course(rest, slice(2, own.stop)), x, course.edges * x)
+            x, slope = (course(each, slice(1, None)) for each in (motion, turn * motion))
+            r = _left(course(rest, slice(2, own.stop)), x, course.edges * x, course.edges * slope)
+            whole = (_of_square(r, each**2) for each in (x, slope))
+            (gain, of_gain), (instants, of_instants) = (
+                np.where(each[0] > other[0], each, (other[0], np.maximum(each[1], other[1])))
+                for each, other in zip(
+                    whole, ((gain, of_gain), (instants, of_instants)), strict=True
+                )
+            )
             curve, of_curve = _curve(r, x)
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
             by_product, of_product = max(found, key=lambda each: each[0].max())
+            spikes = _of_spikes(r)
             curve, by_product = np.where(there[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
         # all channels of a sensor are sampled at one instant; their residuals are not independent
         instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
-        forms: tuple[Form, ...] = ("gain", "instants", "product", "curve")
-        evidence = np.stack([np.abs(gain), np.abs(instants), by_product, curve])
-        shares = np.stack([of_gain, of_instants, of_product, of_curve])
+        forms: tuple[Form, ...] = ("gain", "instants", "product", "curve", "spikes")
+        of_share = CERTAIN * spikes / SPIKES
+        evidence = np.stack([np.abs(gain), np.abs(instants), by_product, curve, of_share])
+        shares = np.stack([of_gain, of_instants, of_product, of_curve, spikes])
         band = float(self.frequency[own.start]), float(self.frequency[own.stop - 1])
         for place, best in enumerate(evidence.argmax(axis=0).tolist()):
             channel, share, form, size = int(tested[place]), shares[best, place], forms[best], 0.0
@@ -204,7 +216,7 @@ class _Sensor:
                 scale = np.mean(squares[0][place]) / np.mean(squares[best][place])
                 size = float(np.sqrt(share * there[channel] * scale))
             share = min(abs(share), 1.0)
-            if (size or form == "product") and WITHIN_BAND * share < 1:
+            if form == "product" or (size and share < MUCH):
                 alike = felt[channel] * size**2 * (1.0 if form == "gain" else np.abs(turn) ** 2)
                 alike = np.maximum(share * left[channel, own].mean(), alike)
                 most = np.minimum(WITHIN_BAND * alike, most)
@@ -230,7 +242,7 @@ class _Courses:
     """
 
     def __init__(self, window: FloatArray, stop: int) -> None:
-        self._n = n = 2 * (int(1.25 * stop) + 1)
+        self._n = n = min(2 * (int(1.25 * stop) + 1), len(window))
         self._middle = slice(n // 4, n - n // 4)
         at = np.arange(n)[self._middle] * (len(window) / n)
         self._window = np.interp(at, np.arange(len(window)), window).astype(np.float32)
@@ -264,6 +276,14 @@ def _evidence(along: FloatArray) -> FloatArray:
     t = along.mean(axis=1) / np.maximum(along.std(axis=1, ddof=1), _LEAST) * np.sqrt(n)
     normal = np.sqrt((n - 1) * np.log1p(t**2 / (n - 1))) * (8 * n - 7) / (8 * n - 5)  # Wallace
     return np.asarray(np.copysign(normal, t))
+
+
+def _of_spikes(r: Samples) -> FloatArray:
+    """Return the share of noise that is in few samples, shape (n_channels,)."""
+    power = r.reshape(len(r), -1) ** 2
+    few = max(1, round(RARE * power.shape[1]))
+    highest = np.partition(power, power.shape[1] - few, axis=1)[:, -few:]
+    return np.asarray(highest.sum(axis=1) / np.maximum(power.sum(axis=1), _LEAST))
 
 
 def _of_product(r: Samples, product: Samples) -> tuple[FloatArray, FloatArray]:

@@ -154,6 +154,8 @@ class Stability:
         Noise added by these segments, as a fraction, for the worst band and channel.
     channel : int
         That channel.
+    by_disturbed : float64, shape (n_channels,)
+        Noise that they add to each, for the worst band; NaN where that is not known.
     is_restless : bool
         Whether the noise changes from segment to segment, at some frequencies.
     loudness : Loudness or None
@@ -176,6 +178,7 @@ class Stability:
     disturbed: IntArray
     excess: float = field(metadata={"key": "excess_share"})
     channel: int
+    by_disturbed: FloatArray = field(metadata=NOT_IN_JSON)
     is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
     loudness: Loudness | None = field(default=None, metadata=NOT_IN_JSON)
     steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
@@ -257,8 +260,8 @@ class Stability:
 
     def among(self, channels: Sequence[int], sensors: Sequence[int], n_channels: int) -> Stability:
         """Return the same with channels and sensors numbered among all, dead ones included."""
-        added = np.zeros(n_channels)
-        added[list(channels)] = self.added
+        added, by_disturbed = np.zeros((2, n_channels))
+        added[list(channels)], by_disturbed[list(channels)] = self.added, self.by_disturbed
         explained, within = np.zeros((2, len(self.low), n_channels))
         explained[:, list(channels)], within[:, list(channels)] = self.explained, self.within
         return replace(
@@ -267,6 +270,7 @@ class Stability:
             runs=None if self.runs is None else self.runs.among(channels, n_channels),
             channel=channels[self.channel],
             added=added,
+            by_disturbed=by_disturbed,
             loudness=self.loudness and self.loudness.among(channels, n_channels),
             explained=explained,
             within=within,
@@ -453,6 +457,7 @@ def stability(
         disturbed=np.flatnonzero(single.disturbed),
         excess=float(single.excess.max()),
         channel=int(single.excess.max(axis=0).argmax()),
+        by_disturbed=single.excess.max(axis=0),
         is_restless=single.is_restless,
         loudness=loudness,
         steadied=() if without is None else (without,),

@@ -64,7 +64,7 @@ class Source(enum.StrEnum):
     GUSTS = "gusts"
     """The loudness of the noise changes at all frequencies: a mean over these scatters with it."""
     FAULTY = "faulty"
-    """The channel is clipped, or was dead for a while: its noise is lower than the estimate."""
+    """The channel is clipped, dead for a while, or disturbed: its noise is below the estimate."""
     SENSITIVITY = "sensitivity"
     """The sensitivity is as certain as its certificate, or its tolerance, states."""
     TEMPERATURE = "temperature"

@@ -284,15 +284,22 @@ class NoiseDependsOnMotion(Fact):
         elif self.form == "filled":
             what = f"Noise of {who} is larger where its motion is smaller"
             do = "are samples filled in?"
+        elif self.form == "spikes":
+            what, do = f"Noise of {who} is mostly spikes", "are samples late or lost?"
         elif self.form == "product":
             what = f"{who} has a product of motion along two axes"
         else:
             what = f"{who} bends, by neither squares nor cubes"
         return Words(
             f"{what}; {do}",
-            f"{what}. Noise of {listed(self.channels)} depends on the motion at the same instant "
-            f"({self.evidence:.0f} standard deviations), and may be lower without it. The "
-            "intervals include it.",
+            f"{what}. "
+            + (
+                "Most of its power is in few samples. "
+                if self.form == "spikes"
+                else f"Noise of {listed(self.channels)} depends on the motion at the same instant "
+                f"({self.evidence:.0f} standard deviations). "
+            )
+            + "It may be lower without that; the intervals include it.",
             "Check the sensor, its range, and how its samples are timed or filled in; or record "
             "with less motion.",
         )

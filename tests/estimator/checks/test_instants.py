@@ -93,7 +93,7 @@ def test_what_bends_otherwise_is_a_curve(kind: str) -> None:
     assert not found[0].size
 
 
-def test_short_gaps_that_are_filled_are_noise_where_motion_is_slow() -> None:
+def test_short_gaps_that_are_filled_are_spikes_or_noise_where_motion_is_slow() -> None:
     rng = np.random.default_rng(4)
     sensors = bench(rng, 40.0, 3, 3)
     within = np.linspace(0, 1, 7)[1:-1, None]
@@ -101,7 +101,17 @@ def test_short_gaps_that_are_filled_are_noise_where_motion_is_slow() -> None:
         before, after = sensors[0][[at - 1, at + 5]]
         sensors[0][at : at + 5] = before + within * (after - before)
     found = dependences(rng, sensors)
-    assert {(each.channel // 3, each.form) for each in found} == {(0, "filled")}
+    assert {each.channel // 3 for each in found} == {0}
+    assert {each.form for each in found} <= {"filled", "spikes"}
+
+
+def test_single_samples_that_are_late_are_spikes() -> None:
+    rng = np.random.default_rng(7)
+    sensors = bench(rng, 45.0, 3, 3)
+    late = rng.integers(1, N_SAMPLES, 100)
+    sensors[2][late] = sensors[2][late - 1]
+    found = dependences(rng, sensors)
+    assert {(each.channel // 3, each.form) for each in found} == {(2, "spikes")}
 
 
 KINDS = ["steady", "gusts", "bursts", "noise in gusts", "heavy tails", "lag", "low pass", "step"]

@@ -283,6 +283,7 @@ def test_a_range_of_octaves_that_is_not_steadied_keeps_what_its_changes_explain(
         disturbed=np.zeros(0, np.int64),
         excess=0.0,
         channel=0,
+        by_disturbed=np.zeros(2),
     )
     csm = np.zeros((1, 2, 2), np.complex128)
     within = Steadied(csm, 10.0, np.zeros(0, np.int64), np.zeros((1, 2)))
