@@ -6,7 +6,7 @@ that vary leave is ``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(
 or seldom: their mean is 0, but their square follows that of the slope or of the motion, instant by
 instant, where averages of segments show noise.
 
-Residuals are those of spectra of segments, with unit power at all frequencies of two octaves. Both
+Residuals are those of spectra of segments, with unit power at all frequencies up to an end. Both
 tests compare segments with each other, so that no distribution of the noise is assumed. Evidence
 is in standard deviations of a normal variable.
 """
@@ -29,8 +29,8 @@ Form: TypeAlias = Literal["curve", "product", "gain", "instants", "filled", "spi
 """Of what depends on the motion; "product": as that of two channels of a sensor; "filled": what is
 there where motion, or its slope, is small. Or "spikes": in single samples, as late or lost ones."""
 WIDTH = 4.0
-"""Highest over lowest frequency of a band."""
-LEAST_BINS = 16
+"""Highest frequency of a band over that of the next."""
+LEAST_BINS = 26
 """Frequencies of a band."""
 NOT_WEAK, LOUD = 4.0, 50.0
 """Power of a channel over what others do not predict, from which it is compared, and named."""
@@ -111,14 +111,9 @@ def dependences(
     most_predictors : int
     """
     found: list[Dependence] = []
-    for each in range(int(sensor.max()) + 1):
-        own = np.flatnonzero(sensor == each)
-        others = np.flatnonzero(sensor != each)[:most_predictors]
-        if len(others) > len(spectra) // 2:
-            continue
-        wanted, known = (spectra[:, some].transpose(2, 0, 1) for some in (own, others))
-        left = without(known.astype(np.complex128), wanted.astype(np.complex128))
-        motion, rest = (x.transpose(2, 1, 0).astype(np.complex64) for x in (wanted, left))
+    for own, left in _residuals(spectra, sensor, most_predictors):
+        motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2))
+        rest = left.transpose(2, 1, 0).astype(np.complex64)
         of_sensor = _Sensor(motion, rest, frequency, window)
         for number, band in enumerate(_bands(frequency, highest)):
             clear = of_sensor.clearest(band, is_highest=number == 0)
@@ -128,6 +123,33 @@ def dependences(
         most[one.band] = max(most[one.band], one.power)
     found = [each for each in found if each.is_loud and each.power > PART * most[each.band]]
     return sorted(found, key=lambda each: -each.evidence)
+
+
+def _residuals(
+    spectra: NDArray[np.complexfloating], sensor: IntArray, most_predictors: int
+) -> Iterator[tuple[IntArray, ComplexArray]]:
+    """Yield the channels of each sensor, and what others leave of them, (n_freqs, n_segments, n).
+
+    Where all others predict, these are columns of the inverse of R, ``spectra = Q R``, for all
+    sensors at once. Half of the segments or more are left to tell noise from what is explained.
+    """
+    n_segments, n = spectra.shape[:2]
+    owns = [np.flatnonzero(sensor == each) for each in range(int(sensor.max()) + 1)]
+    of_all = n - min(map(len, owns))
+    if 2 * min(of_all, most_predictors) > n_segments:
+        return
+    if of_all > most_predictors:
+        for own in owns:
+            others = np.flatnonzero(sensor != sensor[own[0]])[:most_predictors]
+            known, wanted = (spectra[:, e].transpose(2, 0, 1) for e in (others, own))
+            yield own, without(known.astype(np.complex128), wanted.astype(np.complex128))
+        return
+    q, r = np.linalg.qr(spectra.transpose(2, 0, 1).astype(np.complex128))
+    size = np.maximum(np.abs(np.einsum("fii->f", r)), _LEAST)
+    inverse = np.linalg.inv(r + 1e-15 * size[:, None, None] * np.eye(n)).conj().swapaxes(1, 2)
+    for own in owns:
+        some = inverse[..., own]
+        yield own, q @ (some @ np.linalg.inv(some.conj().swapaxes(1, 2) @ some))
 
 
 def without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:
@@ -140,10 +162,8 @@ def _bands(frequency: FloatArray, highest: float) -> Iterator[slice]:
     """Yield the frequencies of the bands, the highest first."""
     high = int(np.searchsorted(frequency, highest))
     while high > LEAST_BINS:
-        low = max(2, int(high / WIDTH))
-        if high - low >= LEAST_BINS:
-            yield slice(low, high)
-        high = low
+        yield slice(2, high)
+        high = int(high / WIDTH)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,34 +189,25 @@ class _Sensor:
         """
         felt, left = (np.mean(np.abs(e) ** 2, axis=1) for e in (self.motion, self.rest))
         there = left[:, own].sum(axis=1) / np.maximum(felt[:, own].sum(axis=1), _LEAST)
-        tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (there < 1 / NOT_WEAK))
+        noise = np.mean(left[:, own] / np.maximum(felt[:, own], _LEAST), axis=1)
+        tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (noise < 1 / NOT_WEAK))
         if not len(tested):
             return
         turn = (2j * np.pi * self.frequency).astype(np.complex64)
         rest = self.rest[tested] / np.sqrt(np.maximum(left[tested, None], _LEAST))
         motion, course = self.motion[tested], _Courses(self.window, own.stop)
-        x, slope = course(motion, own), course(turn * motion, own)
+        everything = slice(1, None) if is_highest else own
+        x, slope = (course(each, everything) for each in (motion, turn * motion))
         r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
         (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
-        curve = of_curve = np.zeros(len(tested))
-        by_product, of_product, spikes = curve, of_curve, of_curve
+        curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
         if is_highest:
-            x, slope = (course(each, slice(1, None)) for each in (motion, turn * motion))
-            r = _left(course(rest, slice(2, own.stop)), x, course.edges * x, course.edges * slope)
-            whole = (_of_square(r, each**2) for each in (x, slope))
-            (gain, of_gain), (instants, of_instants) = (
-                np.where(each[0] > other[0], each, (other[0], np.maximum(each[1], other[1])))
-                for each, other in zip(
-                    whole, ((gain, of_gain), (instants, of_instants)), strict=True
-                )
-            )
-            curve, of_curve = _curve(r, x)
+            spikes, (curve, of_curve) = _of_spikes(r), _curve(r, x)
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
             by_product, of_product = max(found, key=lambda each: each[0].max())
-            spikes = _of_spikes(r)
-            curve, by_product = np.where(there[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
+            curve, by_product = np.where(noise[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
         # all channels of a sensor are sampled at one instant; their residuals are not independent
         instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
         forms: tuple[Form, ...] = ("gain", "instants", "product", "curve", "spikes")
@@ -228,7 +239,7 @@ class _Sensor:
                 size=size,
                 explained=most.astype(np.float64),
                 power=float(share * there[channel]),
-                is_loud=bool(there[channel] < 1 / LOUD),
+                is_loud=bool(noise[channel] < 1 / LOUD),
             )
 
 
@@ -242,7 +253,7 @@ class _Courses:
     """
 
     def __init__(self, window: FloatArray, stop: int) -> None:
-        self._n = n = min(2 * (int(1.25 * stop) + 1), len(window))
+        self._n = n = min(32 * (int(2.5 * stop) // 32 + 1), len(window))
         self._middle = slice(n // 4, n - n // 4)
         at = np.arange(n)[self._middle] * (len(window) / n)
         self._window = np.interp(at, np.arange(len(window)), window).astype(np.float32)

@@ -27,8 +27,9 @@ _SMOOTH = 3  # sizes below the usual second difference, from which a curve is no
 _SIZES = 64  # factors of four, from 4**-32
 _RUN = 4  # samples of a short gap, which lie on a line with those beside them
 _BESIDE = 16  # samples before and after, which are not quiet
-_EXACT, _OF_COUNTS = 1e-6, 2.0  # of the usual second difference, or counts: those of such a gap
+_EXACT, _STEPS = 1e-6, 2.1  # of the usual second difference, or counts: those of such a gap
 _COARSE = 400.0  # counts of the usual second difference below which two are no sign of a line
+_OF_A_STEP, _MOSTLY = 0.05, 0.9  # of a step that most differences are from a multiple of it
 _FEW = 8  # short gaps that may be chance
 
 
@@ -110,9 +111,13 @@ class FlatlineDetector:
         bend = before - 2 * here + after
         some = slice(None, None, max(1, len(at) // 256))
         usual = np.median(np.abs(bend[some]), axis=0)
-        whole = (np.rint(here[some]) == here[some]).all(axis=0)
-        allowed = np.where(whole, _OF_COUNTS, _EXACT * usual)
-        least = np.where(whole, _COARSE, 1e3 * allowed)
+        step = np.where(np.abs(bend) > _EXACT * usual, np.abs(bend), np.inf).min(axis=0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            apart = bend[some] / step - np.rint(bend[some] / step)
+        counts = (np.abs(apart) < _OF_A_STEP).mean(axis=0) > _MOSTLY
+        allowed = np.where(counts, _STEPS * step, _EXACT * usual)
+        least = np.where(counts, _COARSE * step, 1e3 * allowed)
+        least = np.maximum(least, _STILL * np.abs(here).max(axis=0))
         row, channel = np.nonzero((np.abs(bend) <= allowed) & (usual > least))
         near = at[row][:, None] + np.arange(-_BESIDE, _BESIDE + 1)
         bends = np.abs(np.diff(samples[near, channel[:, None]], 2, axis=1))

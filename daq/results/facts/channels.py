@@ -15,6 +15,7 @@ from estimator.checks.advice import Rank
 from estimator.checks.instants import Form
 from estimator.checks.sensitivities import CAUSES, TOLERANCE, likely_cause, wrong_gains
 from estimator.levels.bands import third_octaves
+from estimator.median import median
 from estimator.records import Hertz, Seconds, Share
 from estimator.wording import Words, few, listed, percent, several
 
@@ -438,9 +439,9 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
             continue
         inside = slice(int(edges[0]), int(edges[-1]))
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares_of = [np.nanmean(e.most[inside] / noise[inside, e.column]) for e in of_sensor]
+            most = [median(e.most[inside] / noise[inside, e.column]) for e in of_sensor]
         yield NoiseDependsOnMotion(
-            rank=Rank.DELAYS if max(shares_of) > MUCH_NONLINEAR else Rank.TO_KNOW,
+            rank=Rank.TO_KNOW if max(most) <= MUCH_NONLINEAR else Rank.DELAYS,
             sensors=(sensor,),
             channels=tuple(
                 snapshot.channels[column].name for column in sorted({e.column for e in of_sensor})

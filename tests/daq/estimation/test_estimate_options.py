@@ -195,8 +195,9 @@ def test_gaps_that_a_spline_fills_are_seen(counts: int) -> None:
     assert detector.for_a_while()[0] == pytest.approx(5, abs=1)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1.2345e-9])
 @pytest.mark.parametrize("counts", [0, 1000])
-def test_short_gaps_that_lines_fill_are_seen(counts: int) -> None:
+def test_short_gaps_that_lines_fill_are_seen(counts: int, unit: float) -> None:
     rng = np.random.default_rng(5)
     samples = rng.standard_normal((60_000, 2)) * max(counts, 1)
     for at in 100 * rng.choice(np.arange(1, 599), 50, replace=False):
@@ -204,9 +205,18 @@ def test_short_gaps_that_lines_fill_are_seen(counts: int) -> None:
         samples[at : at + 8, 1] = np.linspace(before, after, 10)[1:-1]
     samples = np.rint(samples) if counts else samples
     detector = FlatlineDetector(500, 2, RATE)
-    for some in np.split(samples, 6):
+    for some in np.split(unit * samples, 6):
         detector.add(some, np.ones(len(some), np.bool_))
     assert detector.for_a_while() == pytest.approx([0, 50 * 8 / RATE], rel=0.1)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1.2345e-9])
+def test_coarse_counts_are_no_lines(unit: float) -> None:
+    """Of three counts, one of a few second differences is 0, four times together by chance."""
+    samples = unit * np.rint(3 * np.random.default_rng(6).standard_normal((60_000, 2)))
+    detector = FlatlineDetector(500, 2, RATE)
+    detector.add(samples, np.ones(len(samples), np.bool_))
+    assert detector.for_a_while().tolist() == [0, 0]
 
 
 def test_slow_motion_in_coarse_counts_or_gusts_is_not_interpolated() -> None:
