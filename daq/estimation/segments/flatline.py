@@ -13,6 +13,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from estimator.median import median
+
 FloatArray = NDArray[np.float64]
 
 _PARTS = 8  # of a hop, examined one by one
@@ -110,7 +112,7 @@ class FlatlineDetector:
         before, here, after = (samples[_BESIDE + n : end + n : _RUN] for n in (-1, 0, 1))
         bend = before - 2 * here + after
         some = slice(None, None, max(1, len(at) // 256))
-        usual = np.median(np.abs(bend[some]), axis=0)
+        usual = median(np.abs(bend[some]))
         step = np.where(np.abs(bend) > _EXACT * usual, np.abs(bend), np.inf).min(axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             apart = bend[some] / step - np.rint(bend[some] / step)
@@ -124,7 +126,7 @@ class FlatlineDetector:
         on_it = bends[:, _BESIDE - _RUN : _BESIDE + _RUN - 1] <= allowed[channel, None]
         runs = sliding_window_view(on_it, _RUN, axis=1).all(axis=-1).any(axis=-1)
         ends = (bends[:, : _BESIDE // 2], bends[:, -_BESIDE // 2 :])
-        beside = np.maximum(*(np.median(each, axis=1) for each in ends))
+        beside = np.maximum(*(median(each.T) for each in ends))
         runs &= (beside > least[channel]) & usable[near].all(axis=1)
         self.counts[-1] += np.bincount(channel[runs], minlength=self.counts.shape[1])
 

@@ -34,6 +34,7 @@ from daq.estimation import snapshot_builder
 from daq.estimation.contributions import contributions
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.protocols.block import HostTime
 from daq.results.facts.recordings import SpanShortened
 from estimator.levels.contributions import Source
 from estimator.spectra.segment_rejection import Reason
@@ -368,7 +369,7 @@ def test_a_scheduler_in_the_open_is_named(address: str, *, exposed: bool) -> Non
 
 @pytest.mark.parametrize("alone", [pytest.param(False, marks=pytest.mark.long), True])
 def test_recordings_whose_clocks_are_not_understood_are_left_out(
-    tmp_path: Path, *, alone: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, alone: bool
 ) -> None:
     good, bad = tmp_path / "good.h5", tmp_path / "bad.h5"
     settings = Settings(methods=("three-sensor",))
@@ -376,6 +377,7 @@ def test_recordings_whose_clocks_are_not_understood_are_left_out(
     clocks = (known_clocks.Oscillator(), known_clocks.Oscillator(400.0), known_clocks.Oscillator())
     known_clocks.record(bad, replace(scene, clocks=clocks))  # faster than any oscillator
     if not alone:
+        monkeypatch.setattr(known_clocks, "_ORIGIN", HostTime(0, START_NS))
         known_clocks.record(good, replace(scene, seed=2))
     paths = [bad] if alone else [good, bad]
     store = store_for(tmp_path / "store", paths[0], settings)
