@@ -146,12 +146,13 @@ def _by_disturbed(snapshot: Snapshot) -> FloatArray:
     """Return the share of the noise of each channel that disturbed segments may be."""
     found = snapshot.diagnostics.diagnosis
     steady = None if found is None else found.stability
-    n_disturbed = 0 if steady is None else len(steady.disturbed)
-    if steady is None or not 0 < n_disturbed <= max(3, SELDOM * steady.n_segments):  # else: gusts
+    if steady is None or not len(steady.disturbed):
         return np.zeros(len(snapshot.channels))
-    more = np.nan_to_num(steady.by_disturbed, nan=math.inf)
+    more = np.nan_to_num(steady.by_disturbed, nan=math.inf)  # taken for motion
     share = DISTURBED * (1 - 1 / (1 + np.maximum(more, 0.0)))
-    return np.where(more > LARGE, math.inf, np.where(more > SMALL, share, 0.0))
+    most = np.where(more > LARGE, math.inf, np.where(more > SMALL, share, 0.0))
+    is_seldom = len(steady.disturbed) <= max(3, SELDOM * steady.n_segments)
+    return np.where(is_seldom | np.isinf(more), most, 0.0)
 
 
 def _faulty(snapshot: Snapshot, psd: FloatArray, by_disturbed: FloatArray) -> Contribution:

@@ -126,6 +126,25 @@ def test_a_tap_as_loud_as_the_motion_names_the_sensor_and_opens_its_interval() -
         assert mean.low[0] <= NOISE <= mean.high[0]
 
 
+def test_many_taps_of_one_sensor_open_its_interval() -> None:
+    """12 in 20 min beside motion of 20 dB, in more than a twentieth of the segments."""
+    rng = np.random.default_rng(81)
+    motion = 10 * rng.standard_normal((N, 3))
+    samples = {
+        name: motion @ Rotation.random(random_state=n).as_matrix().T + rng.standard_normal((N, 3))
+        for n, name in enumerate("ABC")
+    }
+    for at in np.linspace(800, N - 800, 12).astype(int):
+        samples["A"][at : at + 4] += 150 * rng.standard_normal((4, 3))
+    snapshot = huddle.self_noise(samples, fs=RATE, segment="10s").snapshot
+    assert snapshot.diagnostics.diagnosis is not None
+    assert snapshot.diagnostics.diagnosis.stability is not None
+    assert len(snapshot.diagnostics.diagnosis.stability.disturbed) > 0.05 * snapshot.n_segments
+    result = Result(snapshot, Settings())
+    for mean in result.means(result.method, (1.0, 9.0))[:3]:
+        assert mean.low[0] <= 2 / RATE <= mean.high[0]
+
+
 def test_a_tap_that_looks_like_a_gain_in_a_short_test_opens_the_interval() -> None:
     """Of 23 segments beside motion of 6 dB: up to 21 times too high, known to 12 %."""
     rng = np.random.default_rng(80)
