@@ -15,6 +15,9 @@ from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.multiresolution import Band
 from estimator.types import FloatArray
 
+_OF_SQUARES = 0.02
+"""Power that squares and cubes explain, over the most that depends on the motion, from which these
+are what bends: their own contribution has it."""
 _SHOWN = 2.0
 """Power of a channel over what other sensors leave of it, below which none can be loud enough."""
 
@@ -82,7 +85,14 @@ def nonlinear_channels(
         )
         for each in tested.dependences(sensor)
     ]
-    return tuple(nonlinear), tuple(dependent)
+    by_squares = {each.column: each.explained for each in nonlinear}
+    return tuple(nonlinear), tuple(
+        each
+        for each in dependent
+        if each.form not in {"curve", "gain"}
+        or each.column not in by_squares
+        or by_squares[each.column].sum() < _OF_SQUARES * each.most.sum()
+    )
 
 
 def linearised(

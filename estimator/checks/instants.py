@@ -1,14 +1,15 @@
 """Whether what others do not predict of a channel depends on its motion at the same instant.
 
 Own noise knows nothing of the motion. What a hysteresis, the steps of a converter or a limited
-speed leave has a mean that is a curve of the motion, or of its slope. What instants of samples
-that vary leave is ``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast
-or seldom: their mean is 0, but their square follows that of the slope or of the motion, instant by
-instant, where averages of segments show noise.
+speed leave has a mean that is a curve of the motion. What instants of samples that vary leave is
+``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast or seldom: their
+mean is 0, but their square follows that of the slope or of the motion, instant by instant, where
+averages of segments show noise.
 
-Residuals are those of spectra of segments, with unit power at all frequencies up to an end. Both
+Residuals are those of spectra of segments, with unit power at all frequencies up to an end. These
 tests compare segments with each other, so that no distribution of the noise is assumed. Evidence
-is in standard deviations of a normal variable.
+is in standard deviations of a normal variable. Single samples that hold most of the noise are
+spikes: no motion is needed for these.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ there where motion, or its slope, is small. Or "spikes": in single samples, as l
 WIDTH = 4.0
 """Highest frequency of a band over that of the next."""
 LEAST_BINS = 26
-"""Frequencies of a band."""
+"""Least frequencies of a band."""
 NOT_WEAK, LOUD = 4.0, 50.0
 """Power of a channel over what others do not predict, from which it is compared, and named."""
 VERY_LOUD = 1000.0

@@ -281,16 +281,16 @@ class NoiseDependsOnMotion(Fact):
             what = f"Sampling instants of {own} vary by about {1e6 * (self.instants or 0):.2g} µs"
             do = "check how its samples are timed"
         elif self.form == "gain":
-            what = f"The gain of {who} varies by about {percent(self.gain or 0)} at every moment"
+            what = f"The gain of {who} varies by about {percent(self.gain or 0)} within segments"
         elif self.form == "filled":
             what = f"Noise of {who} is larger where its motion is smaller"
             do = "are samples filled in?"
         elif self.form == "spikes":
             what, do = f"Noise of {who} is mostly spikes", "are samples late or lost?"
         elif self.form == "product":
-            what = f"{who} has a product of motion along two axes"
+            what = f"{who}: not linear, by a product of two axes"
         else:
-            what = f"{who} bends, by neither squares nor cubes"
+            what = f"{who}: not linear, beyond squares and cubes"
         return Words(
             f"{what}; {do}",
             f"{what}. "

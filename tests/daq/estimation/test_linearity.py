@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from daq.results.facts.channels import NoiseDependsOnMotion, NotLinear
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_noise import ResponseChanges
+from estimator.checks.instants import Form
 
 RATE, N_SAMPLES = 100.0, 30_000
 EDGES = np.array([1.0, 5.0, 10.0, 20.0, 40.0])
@@ -36,6 +39,7 @@ def test_a_square_is_in_the_interval_or_subtracted(linearise: bool, scale: float
     assert fact.shares[0] == pytest.approx(8 / 9, abs=0.1)  # (2e-3)**2 * 2 * 1e6 over 1
     assert fact.rank is (Rank.TO_KNOW if linearise else Rank.DELAYS)
     assert fact.is_subtracted is linearise
+    assert not snapshot.dependent  # squares and cubes are all that bends
     result = next(iter(snapshot.results.values()))
     found = (
         Result(snapshot, settings)
@@ -79,6 +83,23 @@ def test_instants_that_sway_are_in_the_interval() -> None:
     assert found.mean[2, 3:6].min() > 3 * truth
     assert ((low < truth) & (truth < high))[:, 3:6].all()
     assert np.isfinite(low[:, :3]).all()
+
+
+@pytest.mark.parametrize("form", get_args(Form))
+def test_each_form_of_dependence_has_words(form: Form) -> None:
+    fact = NoiseDependsOnMotion(
+        rank=Rank.DELAYS,
+        sensors=("A",),
+        channels=("A.X",),
+        form=form,
+        evidence=8.0,
+        instants=3e-5 if form == "instants" else None,
+        gain=0.02 if form == "gain" else None,
+    )
+    line, explanation, action = fact.words.line, *str(fact.words).split(". ")[:2]
+    assert "A" in line
+    assert len({line, explanation, action}) == 3
+    assert ("30 µs" in line, "2 %" in line or "2%" in line) == (form == "instants", form == "gain")
 
 
 def test_a_linear_bench_has_no_such_fact_and_the_same_numbers() -> None:
