@@ -136,17 +136,19 @@ def shared_noise(
         return None
     of_band = np.broadcast_to(inflation, (len(bands),)).tolist()
 
-    def of(fit: Maximum) -> dict[int, Scores]:
-        found = (
-            pair_scores(fit, each, n_effective=n_effective, neighbours=neighbours) for each in bands
-        )
-        return {n: each.deflated(of_band[n]) for n, each in enumerate(found) if each is not None}
+    def of(fit: Maximum, some: Sequence[int], at: BoolArray | None = None) -> dict[int, Scores]:
+        inside = {n: bands[n] if at is None else bands[n][at] for n in some}
+        found = {
+            n: pair_scores(fit, each, n_effective=n_effective, neighbours=neighbours)
+            for n, each in inside.items()
+        }
+        return {n: each.deflated(of_band[n]) for n, each in found.items() if each is not None}
 
-    scores = of(maximum)
+    scores = of(maximum, range(len(bands)))
     known = [*scores]
     if not known:
         return None
-    turned = _without_delay(maximum, scores, of, dims)
+    turned = _without_delay(maximum, scores, of, bands, dims)
     if turned is not None:
         maximum, scores = turned
     whole = reduce(add, scores.values())
@@ -208,7 +210,8 @@ def shared_noise(
 def _without_delay(
     maximum: Maximum,
     scores: Mapping[int, Scores],
-    of: Callable[[Maximum], dict[int, Scores]],
+    of: Callable[[Maximum, Sequence[int], BoolArray | None], dict[int, Scores]],
+    bands: Sequence[BoolArray],
     dims: tuple[int, ...],
 ) -> tuple[Maximum, dict[int, Scores]] | None:
     """Return a fit in which the noise that two sensors share is in phase, and its scores.
@@ -226,11 +229,14 @@ def _without_delay(
             continue
         pair, phase, turn, limit = late
         by = np.exp(1j * (phase + turn * np.arange(len(maximum.psi))))
-        turned = maximum.turned(np.flatnonzero(sensor == other[pair]), by)
-        anew = of(turned)
-        after = reduce(add, (anew[n] for n in some))
+        channels = np.flatnonzero(sensor == other[pair])
+        there = np.any([bands[n] for n in some], axis=0)
+        after = reduce(
+            add, of(maximum.take(there).turned(channels, by[there]), some, there).values()
+        )
         if after.z[pair] ** 2 - before.z[pair] ** 2 > limit:
-            return turned, anew
+            turned = maximum.turned(channels, by)
+            return turned, of(turned, [*scores], None)
     return None
 
 
