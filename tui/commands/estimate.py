@@ -14,6 +14,7 @@ from daq.foreign_files import import_command, is_foreign
 from tui.commands.options import DetailsOption, command, with_spanned_options
 from tui.output.console import (
     STANDARD_OUTPUT,
+    TESTING,
     check_places,
     counted,
     for_people,
@@ -152,7 +153,10 @@ def _of_foreign_files(
     from tui.runs.estimate_settings import check_fit, chosen_for_files, spanned
 
     screen = for_people(json)
-    with TemporaryDirectory(prefix="huddle-") as folder, counted("segments", waits=True) as count:
+    with (
+        TemporaryDirectory(prefix="huddle-") as folder,
+        counted("segments", then=TESTING) as count,
+    ):
         try:
             recording, imported = open_files(files, Path(folder), **asked)
         except ImportFormatError as error:
@@ -194,7 +198,7 @@ def estimated(
         )
     with (
         Recording.open(files[0]) as first,  # once, for its settings and for the estimate
-        counted("segments", waits=True) as count,
+        counted("segments", then=TESTING) as count,
     ):
         settings = settings_of(first, start=start, end=end, **wanted)
         snapshot = estimate([first, *files[1:]], settings, progress=count, jobs=jobs)

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
 STANDARD_OUTPUT = "-"
+TESTING = "all segments are read; assumptions are tested"
+"""Said while that takes seconds."""
 _SPEED_PERIOD = 3600.0
 """Seconds over which the time left is predicted: a step may take many minutes."""
 WIDTH_OF_FILES = 110
@@ -143,21 +145,29 @@ def shows_progress() -> bool:
 
 @contextmanager
 def counted(
-    what: str, of: str = "", *, waits: bool = False
+    what: str, of: str = "", *, then: str = ""
 ) -> Iterator[Callable[[int, int], None] | None]:
     """Show how many of something are done, and the time left; yield what is told so, or None.
 
-    From the first that is done on; from the start, if one `waits` for it.
+    From the first that is done on. If work of unknown length follows, `then` is its name: from the
+    start, and after the last.
     """
     if not shows_progress():
         yield None
         return
     from rich.progress import BarColumn, TimeRemainingColumn  # noqa: PLC0415
 
-    done = f"{{task.completed}} of {{task.total}} {of}".rstrip()
-    with progress(what, BarColumn(), done, TimeRemainingColumn()) as bar:
-        task = bar.add_task("", total=None, visible=waits)
-        yield lambda done, total: bar.update(task, completed=done, total=total, visible=True)
+    columns = "{task.description}", BarColumn(), "{task.fields[count]}", TimeRemainingColumn()
+    with progress(*columns) as bar:
+        counting = bar.add_task(what, total=None, visible=bool(then), count="")
+        following = bar.add_task(then, total=None, visible=False, count="")
+
+        def tell(done: int, total: int) -> None:
+            follows, count = bool(then) and done >= total, f"{done} of {total} {of}".rstrip()
+            bar.update(following, visible=follows)
+            bar.update(counting, completed=done, total=total, visible=not follows, count=count)
+
+        yield tell
 
 
 def progress(*columns: str | ProgressColumn, per_second: float = 2) -> Progress:

@@ -117,6 +117,9 @@ async def test_states_and_progress_are_there_before_the_first_estimate(
         assert "○ silent 0:12" in text
         assert "reading what was recorded: 30%" in text
         assert clock_time(7200.0) in text
+        ended = replace(made_now(elapsed=7200.0), closed=True)
+        await shown(pilot, app, StatusUpdated(ended), Progress(1000, 1000))
+        assert "all segments are read; assumptions are tested" in screen_text(app)
         await shown(pilot, app, StatusUpdated(waiting_now()))
         assert screen_text(app).count("○ waiting") == 3
 

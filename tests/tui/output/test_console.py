@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -15,8 +17,11 @@ from daq.recorder.recorder import RecorderStatus
 from daq.recording.sensor_state import SensorState
 from tests.command import huddle
 from tui.commands.record import progress_line
+from tui.output import console as console_module
 from tui.output.console import (
+    TESTING,
     console,
+    counted,
     notices,
     progress,
     reserve_standard_error,
@@ -66,6 +71,21 @@ def test_the_time_left_is_shown_if_each_step_takes_minutes() -> None:
             now += 200.0
             bar.advance(task)
         assert bar.tasks[0].time_remaining == 200.0
+
+
+@pytest.mark.parametrize(("done", "said"), [(2, "2 of 3"), (3, TESTING)])
+def test_what_follows_the_last_segment_has_a_name(
+    done: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = io.StringIO()
+    drawn = Console(file=screen, force_terminal=True, width=100)
+    monkeypatch.setattr(console_module, "shows_progress", lambda: True)
+    monkeypatch.setattr(console_module, "notices", lambda: drawn)
+    with counted("segments", then=TESTING) as tell:
+        assert tell is not None
+        tell(done, 3)
+    assert said in screen.getvalue()
+    assert (TESTING in screen.getvalue()) == (done == 3)
 
 
 def test_files_and_pipes_get_no_progress_and_lines_of_their_width(

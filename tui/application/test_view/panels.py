@@ -16,6 +16,7 @@ from daq.results.facts.methods import WITHOUT_ESTIMATE
 from daq.results.facts.recordings import SensorsSimulated, facts_of_sensors
 from daq.results.vocabulary import FLAG_WORDS, PARTNER_WORDS
 from estimator.wording import clock_time, percent, several
+from tui.output.console import TESTING
 from tui.page.table import Cell, Table, Tone
 from tui.page.terminal import styled
 from tui.wording.facts import RANK_TONES
@@ -222,8 +223,10 @@ def progress_line(
 
 
 def note(now: RecordingStatus | None, done: int, total: int) -> str:
-    """Return what an estimate of many segments is, and how far."""
+    """Return what an estimate of many segments is, and how far; after the last, what follows."""
     closed = now is not None and now.closed
+    if closed and done >= total:
+        return TESTING
     what = "the result is being computed" if closed else "reading what was recorded"
     return f"{what}: {done / total:.0%}"
 
