@@ -13,6 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_noise import (
     DisturbedSegments,
@@ -60,7 +61,6 @@ from estimator.records import dataclass
 from estimator.self_noise.coherency import (
     Coherency,
     PresentSensors,
-    blocks,
     check_averages,
     check_dims,
     check_frequency,

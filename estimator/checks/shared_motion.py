@@ -18,9 +18,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.blocks import blocks
 from estimator.likelihood.goodness_of_fit import critical_value
 from estimator.median import median
-from estimator.self_noise.coherency import blocks, own_channels
+from estimator.self_noise.coherency import own_channels
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_SHARED = 0.3

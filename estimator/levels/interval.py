@@ -37,6 +37,7 @@ from itertools import combinations
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.levels.noise_matrices import of_sensors
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -205,7 +206,6 @@ def cumulants(traces: FloatArray, averages: float, gain: FloatArray | float = 1.
 
 
 _REGULAR = 1e8  # power of a channel over what the others leave unpredicted
-_BLOCK_BYTES = 1 << 21  # of matrices that are inverted together
 LEAST_AVERAGES = 4.0
 """Averages beyond the number of predictors without which nothing is bounded."""
 
@@ -245,9 +245,7 @@ def unpredicted(
     """
     psd = np.einsum("fii->fi", csm).real
     level, averages = np.full((2, *psd.shape), np.nan)
-    step = max(1, _BLOCK_BYTES // (16 * csm.shape[1] ** 2))
-    for low in range(0, len(csm), step):
-        some = slice(low, low + step)
+    for some in blocks(*psd.shape):
         level[some], averages[some] = _unpredicted(csm[some], psd[some], dims, n_effective[some])
     return level, np.stack([level**k / averages ** (k - 1) for k in (2, 3, 4)])
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MANY = 8
@@ -134,10 +135,14 @@ def weights_beside(
 
 def _solved(root: ComplexArray, at: IntArray, U: ComplexArray, sensor: IntArray) -> ComplexArray:
     a, b = pairs(sensor)
-    scaled, per = _scaled(coupling_beside(U, sensor))
-    rows = (root[:, :, a] * root[:, :, b].conj())[at] * per[:, None]
-    found = np.linalg.solve(scaled.swapaxes(1, 2), rows.swapaxes(1, 2))
-    return np.asarray(found.swapaxes(1, 2) * per[:, None])
+    wanted = root[:, :, a] * root[:, :, b].conj()
+    found = np.empty((len(U), *wanted.shape[1:]), np.complex128)
+    for some in blocks(len(U), len(a)):
+        scaled, per = _scaled(coupling_beside(U[some], sensor))
+        rows = wanted[at[some]] * per[:, None]
+        of = np.linalg.solve(scaled.swapaxes(1, 2), rows.swapaxes(1, 2))
+        found[some] = of.swapaxes(1, 2) * per[:, None]
+    return found
 
 
 def mean_coupling(

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.errors import EstimatorError, InsufficientDataError, InvalidMatrixError
 from estimator.levels.noise_matrices import (
     WHOLE,
@@ -35,7 +36,7 @@ from estimator.levels.noise_matrices import (
     solved,
 )
 from estimator.records import dataclass
-from estimator.self_noise.coherency import TOLERANCE, blocks
+from estimator.self_noise.coherency import TOLERANCE
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 _NEARLY_ONE = 1e-4  # share of a channel beside the factors, near zero noise

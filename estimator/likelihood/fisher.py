@@ -17,10 +17,11 @@ from typing import TypeAlias, overload
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.errors import InvalidMatrixError
 from estimator.levels.noise_matrices import coupling_beside, pairs, traces
 from estimator.likelihood.factor_analysis import Maximum
-from estimator.self_noise.coherency import blocks, check_averages
+from estimator.self_noise.coherency import check_averages
 from estimator.types import ComplexArray, FloatArray
 
 Covariance: TypeAlias = "ComplexArray | FloatArray"

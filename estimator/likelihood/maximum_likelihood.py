@@ -18,6 +18,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import (
@@ -32,7 +33,6 @@ from estimator.likelihood.goodness_of_fit import model_test
 from estimator.likelihood.prior import NOISE_SPREAD, expected_noise, kinds, maximise_expecting
 from estimator.self_noise.coherency import (
     Coherency,
-    blocks,
     check_averages,
     check_dims,
     coherency,

@@ -21,9 +21,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from estimator.blocks import BLOCK_BYTES, blocks
 from estimator.likelihood.dimension import bands
 from estimator.records import dataclass
-from estimator.self_noise.coherency import BLOCK_BYTES, blocks, check_dims, own_channels
+from estimator.self_noise.coherency import check_dims, own_channels
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 MIN_COHERENCE = 0.3

@@ -9,10 +9,9 @@ channels did not exist.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.errors import InsufficientDataError, InvalidMatrixError
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag, SelfNoise
@@ -22,8 +21,6 @@ TOLERANCE = 1e-8  # of Hermitian symmetry, and of coherence above 1
 DEAD = 1e-28  # fraction of a channel's largest PSD that is rounding of a constant
 DUPLICATE = 1e-13  # one minus the coherence of a channel and its copy
 SINGULAR = 1e12  # magnitude from which elements of an inverse coherency are only rounding
-BLOCK_BYTES = 1 << 21
-"""Bytes of matrices that are worked on together: several times as much exists for a moment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +72,6 @@ class Coherency:
             self.flags[:, channels],
             self.duplicates[square],
         )
-
-
-def blocks(n_freqs: int, n_channels: int) -> Iterator[slice]:
-    """Yield blocks of frequencies whose matrices take `BLOCK_BYTES`; one in most tests."""
-    step = max(1, BLOCK_BYTES // (16 * max(1, n_channels) ** 2))
-    for low in range(0, n_freqs, step):
-        yield slice(low, min(low + step, n_freqs))
 
 
 def check_dims(dims: tuple[int, ...], n_sensors: int = 3) -> None:

@@ -7,12 +7,13 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from estimator import blocks
 from estimator.checks import band_steadiness, shared_noise
 from estimator.checks.diagnose import diagnose
 from estimator.checks.shared_motion import CanonicalCoherence, is_coherent, seen_by_others
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.maximum_likelihood import standard_error
-from estimator.self_noise import coherency
+from estimator.self_noise.coherency import coherency
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.types import ComplexArray, FloatArray
 from tests.estimator.csm_models import white
@@ -31,7 +32,7 @@ def _averages(n_sensors: int, *, apart: int = 0) -> ComplexArray:
 
 
 def _fitted(csm: ComplexArray, n_factors: int) -> tuple[FloatArray | ComplexArray, ...]:
-    given = coherency.coherency(csm, (3, 3, 3, 3))
+    given = coherency(csm, (3, 3, 3, 3))
     fit = maximise(given.matrix, n_factors)
     error = standard_error(fit, n_effective=N_AVERAGES)
     return given.matrix, given.psd, fit.psi, fit.eigenvectors, fit.discrepancy, error
@@ -45,7 +46,7 @@ def test_blocks_of_frequencies_change_no_result(
     csm[[5, 40]] = np.nan
     csm[20:30] = 0.0  # a block with no usable frequency
     whole = _fitted(csm, n_factors)
-    monkeypatch.setattr(coherency, "BLOCK_BYTES", 7 * csm[0].nbytes)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 7 * csm[0].nbytes)
     for one, other in zip(whole, _fitted(csm, n_factors), strict=True):
         assert np.array_equal(one, other, equal_nan=True)
 
@@ -77,7 +78,7 @@ def test_responses_use_the_frequencies_at_which_all_other_sensors_see_the_motion
 def test_an_estimate_of_many_channels_keeps_few_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
     csm, dims = _averages(8), (3,) * 8
     frequency = np.arange(1.0, N_FREQS + 1)
-    monkeypatch.setattr(coherency, "BLOCK_BYTES", 2 * csm[0].nbytes)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * csm[0].nbytes)
     monkeypatch.setattr(band_steadiness, "PAIR_BYTES", 1 << 16)
     monkeypatch.setattr(shared_noise, "MAX_CHANNELS", 0)  # it takes the square of all pairs
     few = 20.0  # averages, with which nothing is fitted
