@@ -22,6 +22,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.blocks import blocks
 from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
@@ -112,10 +113,12 @@ def dependences(
     most_predictors : int
     """
     found: list[Dependence] = []
-    for own, left in _residuals(spectra, sensor, most_predictors):
+    rest = _residuals(spectra, sensor, most_predictors)
+    if rest is None:
+        return found
+    for own in _channels(sensor):
         motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2))
-        rest = left.transpose(2, 1, 0).astype(np.complex64)
-        of_sensor = _Sensor(motion, rest, frequency, window)
+        of_sensor = _Sensor(motion, rest[own], frequency, window)
         for number, band in enumerate(_bands(frequency, highest)):
             clear = of_sensor.clearest(band, is_highest=number == 0)
             found += [replace(one, channel=int(own[one.channel])) for one in clear]
@@ -126,31 +129,42 @@ def dependences(
     return sorted(found, key=lambda each: -each.evidence)
 
 
+def _channels(sensor: IntArray) -> list[IntArray]:
+    """Return the channels of each sensor."""
+    return [np.flatnonzero(sensor == each) for each in range(int(sensor.max()) + 1)]
+
+
 def _residuals(
     spectra: NDArray[np.complexfloating], sensor: IntArray, most_predictors: int
-) -> Iterator[tuple[IntArray, ComplexArray]]:
-    """Yield the channels of each sensor, and what others leave of them, (n_freqs, n_segments, n).
+) -> NDArray[np.complex64] | None:
+    """Return what other sensors leave of every channel, shape (n_channels, n_segments, n_freqs).
 
     Where all others predict, these are columns of the inverse of R, ``spectra = Q R``, for all
-    sensors at once. Half of the segments or more are left to tell noise from what is explained.
+    sensors at once. None unless half of the segments or more are left to tell noise from what is
+    explained.
     """
-    n_segments, n = spectra.shape[:2]
-    owns = [np.flatnonzero(sensor == each) for each in range(int(sensor.max()) + 1)]
+    n_segments, n, n_freqs = spectra.shape
+    owns = _channels(sensor)
     of_all = n - min(map(len, owns))
     if 2 * min(of_all, most_predictors) > n_segments:
-        return
-    if of_all > most_predictors:
+        return None
+    found = np.empty((n, n_segments, n_freqs), np.complex64)
+    for some in blocks(n_freqs, max(n, n_segments)):
+        part = spectra[:, :, some].transpose(2, 0, 1).astype(np.complex128)
+        if of_all > most_predictors:
+            for own in owns:
+                others = np.flatnonzero(sensor != sensor[own[0]])[:most_predictors]
+                left = without(part[:, :, others], part[:, :, own])
+                found[own, :, some] = left.transpose(2, 1, 0)
+            continue
+        q, r = np.linalg.qr(part)
+        size = np.maximum(np.abs(np.einsum("fii->f", r)), _LEAST)
+        inverse = np.linalg.inv(r + 1e-15 * size[:, None, None] * np.eye(n)).conj().swapaxes(1, 2)
         for own in owns:
-            others = np.flatnonzero(sensor != sensor[own[0]])[:most_predictors]
-            known, wanted = (spectra[:, e].transpose(2, 0, 1) for e in (others, own))
-            yield own, without(known.astype(np.complex128), wanted.astype(np.complex128))
-        return
-    q, r = np.linalg.qr(spectra.transpose(2, 0, 1).astype(np.complex128))
-    size = np.maximum(np.abs(np.einsum("fii->f", r)), _LEAST)
-    inverse = np.linalg.inv(r + 1e-15 * size[:, None, None] * np.eye(n)).conj().swapaxes(1, 2)
-    for own in owns:
-        some = inverse[..., own]
-        yield own, q @ (some @ np.linalg.inv(some.conj().swapaxes(1, 2) @ some))
+            columns = inverse[..., own]
+            left = q @ (columns @ np.linalg.inv(columns.conj().swapaxes(1, 2) @ columns))
+            found[own, :, some] = left.transpose(2, 1, 0)
+    return found
 
 
 def without(predictors: ComplexArray, wanted: ComplexArray) -> ComplexArray:

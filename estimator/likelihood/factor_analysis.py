@@ -174,9 +174,13 @@ class Maximum:
         """Return the fit of some channels times a unit number at each frequency, (n_freqs,)."""
         turn = np.ones(self.psi.shape, np.complex128)
         turn[:, channels] = by[:, None]
-        u = self.eigenvectors * turn[:, :, None]
-        rest = _beside(u) + self.residual * turn[:, :, None] * turn[:, None, :].conj()
-        return replace(self, eigenvectors=u, rest=rest.real + rest.imag)
+        u, rest = self.eigenvectors * turn[:, :, None], np.empty_like(self.rest)
+        for some in blocks(*self.psi.shape):
+            own = turn[some]
+            whole = self.take(some).residual * own[:, :, None] * own[:, None, :].conj()
+            whole += _beside(u[some])
+            rest[some] = whole.real + whole.imag
+        return replace(self, eigenvectors=u, rest=rest)
 
     @property
     def noise_root(self) -> ComplexArray:
