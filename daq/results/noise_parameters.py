@@ -12,15 +12,17 @@ import numpy as np
 from daq.bench.units import canonical, conversion
 from daq.results.band_summary import band_of, correlation_of
 from estimator.errors import InsufficientDataError
-from estimator.levels.bands import band_edges
+from estimator.levels.bands import band_edges, third_octaves
 from estimator.levels.contributions import by_chance
 from estimator.levels.interval import NORMAL_95
 from estimator.records import dataclass
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from daq.bench.model import Bench, DataSheet
     from daq.estimation.snapshot import ChannelLabel
-    from daq.results.band_summary import Estimate, Spectrum
+    from daq.results.band_summary import Estimate, Levels, Spectrum
     from estimator.noise_parameters.allan import AllanDeviation
     from estimator.noise_parameters.fit import NoiseParameters
     from estimator.types import FloatArray
@@ -133,7 +135,9 @@ def noise_parameters(
     frequency, correlation = snapshot.frequency, correlation_of(estimate.settings)
     band = band_of(replace(estimate.settings, band=None), snapshot)
     spectrum = estimate.spectrum(estimate.method)
-    factors = spectrum.levels(band_edges(frequency, band)).deviation
+    edges = third_octaves(frequency, *band)
+    levels = spectrum.levels(edges)
+    bounds = _bounds(noise.noise_psd, levels, edges)
     shares = quantisation_shares(estimate)
     found = []
     for column, label in enumerate(snapshot.channels):
@@ -141,9 +145,10 @@ def noise_parameters(
         parameters = allan = None
         refused = ""
         try:
-            parameters = fit(frequency, psd, cov, correlation, band=band)
-            allan = allan_deviation(frequency, psd, cov, correlation, parameters)
-            parameters, allan = _with_factor(parameters, allan, float(factors[column]))
+            bound = bounds[:, column]
+            parameters = fit(frequency, psd, cov, correlation, band=band, bound=bound)
+            allan = allan_deviation(frequency, psd, cov, correlation, parameters, bound=bound)
+            parameters, allan = _with_factor(parameters, allan, float(levels.deviation[column]))
         except InsufficientDataError as error:
             refused = str(error)
         sheet = _data_sheet(bench, label)
@@ -162,6 +167,27 @@ def noise_parameters(
             )
         )
     return tuple(found)
+
+
+def _bounds(psd: FloatArray, levels: Levels, edges: NDArray[np.int64]) -> FloatArray:
+    """Return by how much noise may be off beside its scatter, (n_freqs, n_channels).
+
+    As the intervals of its bands have it. Where an interval excludes the estimate, all of it.
+    """
+    low, high = levels.ends(factor=False)
+    inner_low, inner_high = levels.of_scatter.interval()
+    inside, sizes = slice(edges[0], edges[-1]), np.diff(edges)
+    known = np.isfinite(psd[inside])
+    total, count = (
+        np.add.reduceat(each, edges[:-1] - edges[0], axis=0)
+        for each in (np.where(known, psd[inside], 0.0), known.astype(np.float64))
+    )
+    mean = total / np.maximum(count, 1.0)
+    off = np.fmax(inner_low - np.fmax(low, 0.0), high - inner_high)
+    off = np.where(mean > high, mean, np.fmax(off, 0.0))
+    found = np.zeros(psd.shape)
+    found[inside] = np.repeat(np.where(np.isnan(off), 0.0, off), sizes, axis=0)
+    return found
 
 
 def quantisation_shares(estimate: Estimate) -> list[tuple[float, float]]:

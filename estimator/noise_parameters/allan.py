@@ -13,7 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.levels.interval import CERTAIN, NORMAL_95
-from estimator.noise_parameters.fit import NoiseParameters, resolution, scatter, terms_at, usable
+from estimator.noise_parameters.fit import (
+    NoiseParameters,
+    reach_of,
+    resolution,
+    scatter,
+    terms_at,
+    usable,
+)
 from estimator.types import FloatArray
 
 LONGEST = 0.3
@@ -59,12 +66,14 @@ def allan_deviation(
     cov: FloatArray,
     correlation: FloatArray,
     parameters: NoiseParameters,
+    *,
+    bound: FloatArray | None = None,
 ) -> AllanDeviation:
     """Return the Allan deviation of an estimate.
 
     Parameters
     ----------
-    frequency, noise_psd, cov, correlation
+    frequency, noise_psd, cov, correlation, bound
         As for `estimator.noise_parameters.fit.fit`.
     parameters : NoiseParameters
         The fit of this estimate.
@@ -100,6 +109,9 @@ def allan_deviation(
     factor = np.exp(np.where(certain, NORMAL_95 * spread / np.where(certain, variance, 1.0), 0.0))
     low = np.where(certain, variance / factor, variance - NORMAL_95 * spread)
     high = np.where(certain, variance * factor, variance + NORMAL_95 * spread)
+    if bound is not None:
+        reach = reach_of(bound[used], part / sigma)
+        low, high = low - reach, high + reach
     return AllanDeviation(
         tau, *(np.sqrt(np.maximum(v, 0.0)) for v in (variance, low, high, fitted))
     )

@@ -132,6 +132,7 @@ def fit(
     correlation: FloatArray,
     *,
     band: tuple[float, float] | None = None,
+    bound: FloatArray | None = None,
 ) -> NoiseParameters:
     """Fit the terms to a self-noise estimate.
 
@@ -148,6 +149,9 @@ def fit(
     band : tuple of float, optional
         Hz. Default: from four times the resolution, below which the window smears the terms, up to
         the highest frequency, excluded.
+    bound : float64, shape (n_freqs,), optional
+        By how much the estimate may be off beside its scatter, in its unit; infinite where nothing
+        is known. Half of what it may change a term is added to the term's error.
 
     Raises
     ------
@@ -178,13 +182,18 @@ def fit(
     inverse = np.linalg.pinv((whitened / scale).T @ (whitened / scale))
     meat = _correlated(whitened / scale, number[keep], correlation)
     covariance = inverse @ meat @ inverse / np.outer(scale, scale) * max(1.0, chi_square)
+    errors = np.sqrt(np.diag(covariance))
+    if bound is not None:
+        regression = inverse @ (whitened / scale).T / scale[:, None] / sigma[keep]
+        wider = errors + reach_of(bound[used][keep], regression) / 2
+        covariance, errors = covariance * np.outer(wider / errors, wider / errors), wider
     inflation = float(np.sqrt(1 + 2 * correlation[1:].sum()))
     bands = [np.arange(*ends)[keep[slice(*ends)]] for ends in pairwise(groups)]
     judged = [(*_mismatch(y[b], (terms @ values)[b], sigma[b]), f[b]) for b in bands if b.size]
     ratio, score, where = max(judged, key=lambda each: abs(each[1]))
     return NoiseParameters(
         values=values,
-        errors=np.sqrt(np.diag(covariance)),
+        errors=errors,
         covariance=covariance,
         low=float(f[0]),
         high=float(f[-1]),
@@ -196,6 +205,20 @@ def fit(
         worst_ratio=ratio,
         worst_score=score / inflation,
     )
+
+
+def reach_of(bound: FloatArray, linear: FloatArray) -> FloatArray:
+    """Return the largest change of quantities that are linear in a PSD, within bounds of it.
+
+    Parameters
+    ----------
+    bound : float64, shape (n_freqs,)
+    linear : float64, shape (n, n_freqs)
+        The quantities in terms of the PSD.
+    """
+    if np.isinf(bound).any():
+        return np.full(len(linear), np.inf)
+    return np.asarray(np.abs(linear) @ bound)
 
 
 def usable(

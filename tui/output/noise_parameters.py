@@ -62,6 +62,8 @@ def term_table(found: Sequence[ChannelParameters]) -> Table:
 
 
 def _term(value: float, error: float) -> str:
+    if not math.isfinite(error):
+        return "?"
     if value > SIGNIFICANT * error:
         return f"{level(value)} ±{10 / math.log(10) * error / value:.2f}"
     return f"< {level(max(value, 0.0) + SIGNIFICANT * error)}"

@@ -16,6 +16,7 @@ from daq.errors import BenchFileError
 from daq.estimation.contributions import with_sensitivities
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
+from daq.formats.arrays import recording_of_arrays
 from daq.protocols.block import HostTime
 from daq.recording.array_writer import ArrayWriter
 from daq.recording.file_format import SensorLayout
@@ -194,3 +195,24 @@ def test_an_uncertain_sensitivity_is_in_terms_allan_deviation_and_data_sheet() -
     np.testing.assert_allclose(reach, np.hypot(scatter, 1.96 * own), rtol=1e-3)
     assert before.comparisons[0].outcome is SheetOutcome.MEETS
     assert after.comparisons[0].outcome is SheetOutcome.NOT_DECIDED
+
+
+def test_what_opens_an_interval_is_in_terms_and_allan_deviation() -> None:
+    rng = np.random.default_rng(16)
+    n, rate = 24_000, 100.0
+    motion = 100 * rng.standard_normal((n, 3))
+    gains = 1 + 0.02 * np.sin(2 * np.pi * np.arange(n) / rate / 40)
+    felt = {"a": motion, "b": motion * gains[:, None], "c": motion @ np.diag([1, -1, -1])}
+    samples = {name: each + rng.standard_normal((n, 3)) for name, each in felt.items()}
+    settings = Settings(segment=2.0)
+    snapshot = estimate([recording_of_arrays(samples, rate)], settings)
+    for each in noise_parameters(Result(snapshot, settings)):
+        assert each.parameters is not None
+        truth = np.array([0.0, 0.0, 2 / rate, 0.0])
+        assert np.all(np.abs(each.parameters.values - truth) < 2.5 * each.parameters.errors)
+        assert each.allan is not None
+        # of the noise up to the highest frequency of the estimate
+        grid = np.linspace(1e-3, each.parameters.high, 20_000)
+        x = np.pi * grid * each.allan.tau[:, None]
+        true = np.sqrt(np.trapezoid(4 / rate * np.sin(x) ** 4 / x**2, grid))
+        assert np.all((0.95 * each.allan.low < true) & (true < 1.05 * each.allan.high))
