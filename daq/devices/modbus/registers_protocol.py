@@ -38,8 +38,10 @@ BLOCK_DURATION = 0.25
 """Host time per block, s."""
 GAP = 2.5
 """Minimum gap, in sample periods: polls jitter, so that one reading may be late."""
-JUMP_NS = 1_000_000_000
-"""Step of the device's time against host time, in ns, above any latency."""
+JUMP_NS = 100_000_000
+"""Step of the device's time, in ns; a gateway may keep readings for less."""
+_STALE_NS = 1e9  # age of the first reading at most
+_FAR_NS = 1 << 62
 DRIFT = 200e-6
 """Largest relative rate error of a device's time."""
 
@@ -246,6 +248,38 @@ def _witmotion_words(time_ns: int) -> list[int]:
     ]
 
 
+class _DeviceTime:
+    """Host time of readings by the device's time.
+
+    A new reading was taken after the poll before it was sent, and before its reply arrived. So no
+    latency hides that the device's time was set.
+    """
+
+    def __init__(self, resolution_ns: int) -> None:
+        self._step = JUMP_NS + resolution_ns
+        self._least, self._largest = -_FAR_NS, _FAR_NS  # host time minus device time
+        self._at = 0
+
+    def placed(
+        self, times: NDArray[np.int64], before: NDArray[np.int64], received: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64] | None, bool]:
+        """Return the host times of readings, in ns, and whether the device's time jumped.
+
+        None where it jumped between these readings. ``before``: when the polls before were sent.
+        """
+        of_each = before - times, received - times
+        own = int(of_each[0].max()), int(of_each[1].min())
+        leak = round(DRIFT * (int(received[-1]) - self._at))
+        lags = max(own[0], self._least - leak), min(own[1], self._largest + leak)
+        jumped = lags[0] > lags[1] + self._step
+        lags = own if jumped else lags
+        apart = lags[0] > lags[1] + self._step
+        if apart:
+            lags = int(of_each[0][-1]), int(of_each[1][-1])
+        self._least, self._largest, self._at = *lags, int(received[-1])
+        return None if apart else times + lags[1], jumped
+
+
 class RegisterDecoder:
     """Decoder: readings in, blocks out.
 
@@ -271,8 +305,8 @@ class RegisterDecoder:
         self._next = 0
         self._last_instant: int | None = None
         self._last_key: int | None = None
-        self._lag = 0.0  # host time minus device time at the smallest latency
-        self._lag_at = 0
+        self._sent_before: int | None = None
+        self._device_time = _DeviceTime(_TICK_NS.get(registers.time_format, 10**6))
 
     def receive(
         self, registers: Sequence[int], sent: HostTime, at: HostTime
@@ -301,34 +335,28 @@ class RegisterDecoder:
         registers = np.array(self._rows, np.uint16)
         sent, received = np.array(self._sent, np.int64), np.array(self._received, np.int64)
         self._rows, self._sent, self._received = [], [], []
+        if self._sent_before is None:
+            self._sent_before = int(sent[0] - max(self._period_ns, _STALE_NS))
+        before = np.concatenate([[self._sent_before], sent[:-1]])
+        self._sent_before = int(sent[-1])
         times = self._map.times_ns(registers)
         keys = self._map.counters(registers) if times is None else times
+        new = np.ones(len(sent), bool)
         if keys is not None:
             new = np.diff(keys, prepend=-1 if self._last_key is None else self._last_key) != 0
-            self._last_key = int(keys[-1])
-            registers, keys, sent, received = registers[new], keys[new], sent[new], received[new]
-            times = keys if times is not None else None
+            self._last_key, keys = int(keys[-1]), keys[new]
+            registers, sent, received = registers[new], sent[new], received[new]
         if not len(registers):
             return []
         found: list[Block | Event] = []
         instants = sent + (received - sent) // 2
         restarted = self._last_instant is None
         if times is not None:
-            lags = received - times
-            lag = int(lags.min())
-            jumped = not restarted and abs(lag - self._lag) > JUMP_NS
-            if jumped or int(lags.max()) - lag > JUMP_NS:
+            placed, jumped = self._device_time.placed(times[new], before[new], received)
+            instants = instants if placed is None else placed
+            if jumped:
                 restarted = True
                 found.append(Event(self._sensor, EventKind.RESET, "the device's time jumped", at))
-                lag = int(lags[-1])
-            if restarted:
-                self._lag = lag
-            else:
-                leak = DRIFT * (at.monotonic_ns - self._lag_at)
-                self._lag = min(lag, self._lag + leak)
-            self._lag_at = at.monotonic_ns
-            if int(lags.max()) - lag <= JUMP_NS:
-                instants = times + round(self._lag)
         counts = self._map.counts(registers)
         return found + self._blocks(counts, instants, keys, restarted=restarted, at=at)
 

@@ -199,6 +199,25 @@ def test_device_time_gives_the_instant_for_any_latency() -> None:
     assert abs(errors[-1]) < 0.5
 
 
+@pytest.mark.parametrize("step", [-30_000, -1000, -500, -200, 200, 500, 1000, 86_400_000])
+@pytest.mark.parametrize("first", [200, 207])
+def test_a_device_time_that_is_set_moves_no_instant(step: int, first: int) -> None:
+    """By ms, before the first reading of a block or another; polls take 1 to 8 ms."""
+    latency = np.random.default_rng(2).uniform(1, 8, 400)
+    one, found = decoder(rate=100.0, time_address=1, time_format="uint32-ms"), []
+    for k in range(400):
+        ms = 50_000 + 10 * k + (step if k >= first else 0)
+        at = host(10.0 * k + latency[k])
+        found += one.receive([k, ms >> 16, ms & 0xFFFF], host(10.0 * k), at)
+    blocks = blocks_of(found)
+    instants = np.concatenate(
+        [block.instants_ns for block in blocks if block.instants_ns is not None]
+    )
+    assert np.abs(instants / MS - 10.0 * np.arange(400) - 4.5).max() < 5
+    assert [block.first_sample for block in blocks] == list(range(0, 400, 25))
+    assert sum(isinstance(item, Event) for item in found) == 1
+
+
 def test_a_device_time_that_jumps_restarts_the_clock() -> None:
     one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
     one.receive([0, 0, 100], host(0), host(0))
