@@ -203,7 +203,7 @@ class _Recorder:
     clock: HostClock
     stop: asyncio.Event
     acknowledged: Callable[[RecorderStatus], None] | None
-    attributes: Mapping[str, str]
+    attributes: Mapping[str, str | float]
     share_of_repeats: ShareOfRepeats | None
 
     def __post_init__(self) -> None:
@@ -318,9 +318,8 @@ class _Recorder:
         self._new_file = partial(
             RecordingWriter.create, bench=self.bench, sensors=ordered, control=address
         )
-        attributes: dict[str, str | float] = {} if duration is None else {"duration": duration}
-        attributes |= self.attributes
-        attributes |= dict.fromkeys(caveats_of(self.bench), 1)
+        self.attributes = {**self.attributes, **dict.fromkeys(caveats_of(self.bench), 1)}
+        attributes = dict(self.attributes, **({} if duration is None else {"duration": duration}))
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})
@@ -410,7 +409,7 @@ class _Recorder:
         if before != self._path and lasted < MIN_CONTINUATION:
             raise DiskError(f"{error}; {self._safe()}") from error
         path = next(each for each in continuation_names(self._path) if not each.exists())
-        attributes: dict[str, str | float] = {CONTINUES: self._writer.run_id}
+        attributes = {**self.attributes, CONTINUES: self._writer.run_id}
         following = None
         try:
             following = self._new_file(path, created=now, attributes=attributes)

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daq.bench.end_condition import EndCondition
+from daq.caveats import Caveat
 from daq.recording.reader import Recording
 from daq.recording.repair import verify
 from tests.scripted_driver import counts
@@ -50,7 +52,8 @@ def test_a_full_disk_ends_the_run_with_an_error(tmp_path: Path) -> None:
 
 REFUSED_ONCE = """
 import asyncio, os, resource, signal, sys
-from daq.recorder.recorder import record
+from daq.caveats import Caveat
+from daq.recorder import recorder
 from daq.host_clock import HostTime
 from tests.scripted_driver import ManualClock, PlayedDevice, PlayedDriver, bench, block, counts
 
@@ -75,9 +78,10 @@ async def main():
                 driver.devices[name].items.put_nowait(block(name, 1000 * sent, 1000, at))
             sent += 1
 
-    status = await record(
+    recorder.caveats_of = lambda _: [Caveat.SIMULATED]
+    status = await recorder.record(
         bench(*"abc"), sys.argv[1], clock=clock, drivers=driver.find, stop=stop,
-        acknowledged=acknowledged,
+        acknowledged=acknowledged, attributes={"until": "5 %"},
     )
     assert samples == sorted(samples)
     print(status.closed, status.sensors["a"].samples, status.path, flush=True)
@@ -102,6 +106,8 @@ def test_a_recording_continues_in_another_file_after_a_disk_error(tmp_path: Path
         assert not first.closed
         assert second.closed
         assert second.continues == first.run_id
+        assert second.until == first.until == EndCondition.of_text("5 %")
+        assert second.caveats == first.caveats == (Caveat.SIMULATED,)
         texts = [event.text for event in second.events]
         assert "continues r.h5, which could no longer be written" in texts
         for name in "abc":
