@@ -33,6 +33,8 @@ RESERVED = ("sampling_rate", "start_time")
 _PLAIN = {"char", "logical", "single", "double"} | {
     f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)
 }
+_FIRST, _LAST = np.datetime64("1678-01-01"), np.datetime64("2262-01-01")
+"""Times that fit 64 bits in ns."""
 _COMPRESSED = 15
 """Kind of a compressed element of a MATLAB file, miCOMPRESSED."""
 
@@ -275,8 +277,11 @@ def _number(path: Path, array: NDArray[Any]) -> float:
 def _instant_ns(path: Path, array: NDArray[Any]) -> int:
     try:
         text = str(array.reshape(()).astype(str)).removesuffix("Z").removesuffix("+00:00")
-        return int(np.datetime64(text, "ns").astype(np.int64))
-    except ValueError as error:
+        found = np.datetime64(text)
+    except ValueError:
+        found = np.datetime64("NaT")
+    if not _FIRST < found < _LAST:  # a number would be a year
         raise ImportFormatError(
             f"{path}: start_time: expected one UTC time as in 2026-11-21T03:00:00, found {array}"
-        ) from error
+        )
+    return int(found.astype("datetime64[ns]").astype(np.int64))

@@ -60,6 +60,7 @@ def test_a_csv_is_read_in_the_encoding_it_has(tmp_path: Path, encoding: str) -> 
         ({"A": np.zeros((5, 2, 1)), **AT}, r"\(n_samples, n_channels\)"),
         ({"A": np.array(["x"]), **AT}, "expected numbers"),
         ({"A": np.zeros(5), "start_time": "noon", **AT}, "start_time"),
+        ({"A": np.zeros(5), "start_time": 1_764_500_000, **AT}, "found 1764500000"),
     ],
 )
 def test_what_an_archive_has_wrong_is_named(
