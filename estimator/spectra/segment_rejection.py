@@ -2,7 +2,7 @@
 
 A segment is excluded if
 
-- samples are missing, or it is clipped;
+- a sample is no number;
 - the power of a channel in an octave differs much from that of the earlier accepted segments;
 - its largest step between samples differs much (a spike attenuated by the window can still exceed
   noise far below the motion);
@@ -30,7 +30,7 @@ from estimator.records import dataclass
 from estimator.spectra.parts import PartEnds
 from estimator.spectra.welch import CrossSpectra, WelchSettings
 from estimator.spectra.windows import get_window
-from estimator.types import BoolArray, FloatArray, IntArray
+from estimator.types import FloatArray, IntArray
 
 FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
 FLATLINE_SAMPLES = 32  # consecutive equal samples of a dead channel
@@ -116,8 +116,6 @@ class SelectedSpectra:
     settings : WelchSettings
     n_channels : int
     rejection : RejectionSettings, optional
-    full_scale : float64, shape (n_channels,), optional
-        A segment with a sample of this magnitude or more is clipped.
     ends : PartEnds, optional
         As of `CrossSpectra`. Segments of a start-up set are in the part in which it ends.
 
@@ -137,7 +135,6 @@ class SelectedSpectra:
         n_channels: int,
         *,
         rejection: RejectionSettings | None = None,
-        full_scale: FloatArray | None = None,
         ends: PartEnds | None = None,
     ) -> None:
         self.settings = settings
@@ -145,10 +142,6 @@ class SelectedSpectra:
         self.n_segments = 0
         self.counts: Counter[Reason] = Counter()
         self.rejected: deque[Rejected] = deque(maxlen=REPORTED)
-        self._full_scale = np.full(n_channels, np.inf) if full_scale is None else full_scale
-        if self._full_scale.shape != (n_channels,):
-            raise EstimatorError(f"full scale of {self._full_scale.shape}, expected {n_channels}")
-        self._limited = bool(np.isfinite(self._full_scale).any())
         self._accepted = CrossSpectra(settings, n_channels, ends=ends)
         self._window = get_window(settings.window, settings.segment_length)[:, None]
         n_freqs = settings.segment_length // 2 + 1
@@ -171,7 +164,6 @@ class SelectedSpectra:
         self,
         samples: FloatArray,
         starts: IntArray,
-        complete: BoolArray | None = None,
         *,
         numbers: IntArray | None = None,
     ) -> None:
@@ -183,8 +175,6 @@ class SelectedSpectra:
             NaN counts as a gap.
         starts : int64, shape (n_segments,)
             In order of time.
-        complete : bool, shape (n_samples,), optional
-            False if any sensor has a gap.
         numbers : int64, shape (n_segments,), optional
             By which excluded segments are known; default: how many were tested before.
 
@@ -206,7 +196,6 @@ class SelectedSpectra:
             for (row, number), levels in zip(tested, levels_of, strict=True):
                 stretch = slice(row, row + self.settings.segment_length)
                 whole = bool(np.isfinite(levels).all())
-                whole &= complete is None or bool(complete[stretch].all())
                 if self._passes(int(number), samples[stretch], levels, whole=whole):
                     passed.append(row)
         self._accepted.add(samples, np.array(passed, dtype=np.int64))
@@ -268,11 +257,6 @@ class SelectedSpectra:
         if not whole:
             self._leave_out(Rejected(number, Reason.GAP, None, np.nan))
             return False
-        if self._limited:
-            clipped = (np.abs(segment) >= self._full_scale).any(axis=0)
-            if clipped.any():
-                self._leave_out(Rejected(number, Reason.CLIPPED, int(np.argmax(clipped)), np.nan))
-                return False
         if self._normal is None:
             self._held.append(_Held(number, segment.copy(), levels))
             if len(self._held) == self.rejection.start_up:

@@ -19,11 +19,9 @@ def quiet(n_segments: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return samples + np.arange(CHANNELS), starts
 
 
-def selected(
-    samples: np.ndarray, starts: np.ndarray, complete: np.ndarray | None = None
-) -> SelectedSpectra:
+def selected(samples: np.ndarray, starts: np.ndarray) -> SelectedSpectra:
     spectra = SelectedSpectra(SETTINGS, CHANNELS)
-    spectra.add(samples, starts, complete)
+    spectra.add(samples, starts)
     return spectra
 
 
@@ -77,30 +75,13 @@ def test_a_spike_attenuated_by_the_window_is_detected(into_segment: int) -> None
     assert [(r.segment, r.channel) for r in spectra.rejected] == [(59, 1), (60, 1)]
 
 
-def test_gaps_and_clipping_are_distinguished() -> None:
-    samples, starts = quiet(60)
-    complete = np.ones(len(samples), dtype=bool)
-    complete[2550] = False
-    samples[4050, 1] = -40.0
-    spectra = SelectedSpectra(SETTINGS, CHANNELS, full_scale=np.array([40.0, 40, 40, np.inf]))
-    spectra.add(samples, starts, complete)
-    assert spectra.counts == {Reason.GAP: 2, Reason.CLIPPED: 2}
-    assert [(r.segment, r.channel) for r in spectra.rejected] == [
-        (24, None),
-        (25, None),
-        (39, 1),
-        (40, 1),
-    ]
-    kept = np.delete(starts, [24, 25, 39, 40])
-    np.testing.assert_allclose(spectra.spectra().csm(), expected(samples, kept), rtol=1e-9)
-
-
 @pytest.mark.parametrize("row", [550, 5050])
 def test_nan_is_always_a_gap(row: int) -> None:
     samples, starts = quiet(60)
     samples[row, 2] = np.nan
     spectra = selected(samples, starts)
     assert spectra.counts == {Reason.GAP: 2}
+    assert [r.channel for r in spectra.rejected] == [None, None]
     assert np.isfinite(spectra.spectra().csm()).all()
 
 
@@ -166,8 +147,6 @@ def test_invalid_settings_and_segments_are_refused() -> None:
     for wrong in ({"threshold": 0.0}, {"start_up": 2}, {"memory": 3}, {"renewal": 0}):
         with pytest.raises(EstimatorError, match="rejection"):
             RejectionSettings(**wrong)
-    with pytest.raises(EstimatorError, match="full scale"):
-        SelectedSpectra(SETTINGS, CHANNELS, full_scale=np.ones(3))
     samples, starts = quiet(5)
     spectra = SelectedSpectra(SETTINGS, CHANNELS)
     with pytest.raises(EstimatorError, match="expected"):
