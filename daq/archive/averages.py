@@ -33,7 +33,7 @@ from estimator.errors import InsufficientDataError
 from estimator.spectra.multiresolution import Band
 from estimator.spectra.parts import Parts
 from estimator.spectra.segment_rejection import Reason
-from estimator.spectra.welch import WelchSettings, kept_rows, scale
+from estimator.spectra.welch import WelchSettings, scale
 from estimator.spectra.windows import effective_averages, get_window
 
 if TYPE_CHECKING:
@@ -102,13 +102,11 @@ class Estimator:
             found = own / first
         return None if np.all((own == first) | (own == 0)) else found
 
-    def left_by_changes(
-        self, spectra: CrossSpectra, kept_at: NDArray[np.int64], place: int, usable: float
-    ) -> FloatArray:
+    def left_by_changes(self, spectra: CrossSpectra, place: int, usable: float) -> FloatArray:
         """Return the share of the noise that responses which change may leave of the motion.
 
-        Of `spectra` with parts of time and single segments, which begin at samples `kept_at`, end
-        at `place`, and are known up to `usable` Hz.
+        Of `spectra` with parts of time and single segments, which end at `place`, and are known up
+        to `usable` Hz.
         Shape (n_freqs, n_channels): negative where noise may be too low, NaN where it is not known.
         """
         unknown = np.full((len(self.welch.frequencies), len(self.channels)), np.nan)
@@ -121,10 +119,11 @@ class Estimator:
         band = in_units(known_part(band, usable), self.channels, self.unit)
         course, kept = None, spectra.segments
         if kept is not None and len(kept):
-            at = kept_at[kept_rows(len(kept_at), kept.every)] / self.welch.sampling_rate
+            order = np.argsort(kept.places)  # those held back are taken late
+            at = kept.places[order] * self.welch.hop / self.welch.sampling_rate
             response = responses(self.welch.frequencies[kept.bins], self.channels, self.unit)
             with np.errstate(invalid="ignore", divide="ignore"):
-                single = kept.values() / np.where(response == 0, np.nan, response)
+                single = kept.values()[order] / np.where(response == 0, np.nan, response)
             place_of = np.searchsorted(bins, kept.bins)
             course = SegmentCourse(single, place_of, at, np.zeros(len(at), np.int64))
         found = steadiness(band, self.dims, course)

@@ -355,8 +355,7 @@ class StretchPass(Pass):
         spectra = self.drain(last=place is None, ends=ends, segments=segments)
         if spectra.n_segments and self._number is not None:
             start, (estimator, grid) = self._number * self._stretch_ns, self._estimator
-            at = self.kept_at[-spectra.n_segments :]
-            share = estimator.left_by_changes(spectra, at, end, self.aligned.usable)
+            share = estimator.left_by_changes(spectra, end, self.aligned.usable)
             self.changed[start] = grid.mean(share)
             self._writer.append(start, spectra.n_segments, spectra.csm())
             self.n_stretches += 1

@@ -27,12 +27,17 @@ from daq.estimation.snapshot_diagnostics import (
 from estimator.checks import diagnose as checks
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit
-from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, SharedNoise
+from estimator.checks.advice_on_noise import (
+    DisturbedSegments,
+    NoiseChanges,
+    ResponseChanges,
+    SharedNoise,
+)
 from estimator.checks.advice_on_sensors import Delay, Gain
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.disturbed_segments import SegmentCourse
+from estimator.checks.disturbed_segments import SegmentCourse, SegmentFindings
 from estimator.checks.stability import Stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood.factor_analysis import Maxima
@@ -344,7 +349,7 @@ def diagnosis(
     Noise that channels seem to share is motion across `axes` that are off, if it is no more than
     this share of the motion, of each sensor.
     Delays between sensors that are `aligned` by their motion or by arrival times are not known.
-    `course` is that of the segments of the only band, `maxima` are fits of the same averages.
+    `course` is that of the shortest segments, `maxima` are fits of the same averages.
 
     Returns
     -------
@@ -377,7 +382,7 @@ def diagnosis(
                     n_factors=n_factors,
                     neighbours=neighbours(band),
                     vertical=vertical,
-                    course=course if len(bands) == 1 else None,
+                    course=course,
                     parts=band.parts,
                     maxima=maxima,
                 )
@@ -403,7 +408,7 @@ def diagnosis(
             advice
             for each in found
             for advice in each.advice
-            if _counts(advice, each, clearest, stability)
+            if _counts(advice, each, clearest, found, stability)
             and not _is_explained(advice, faulty)
             and not _is_fitted(advice, dimensions)
             and not _is_across(advice, each.bands, dims, axes)
@@ -421,6 +426,15 @@ def diagnosis(
     )
     tested = any(np.isfinite(band.test.p_value) for band in whole.bands)
     return whole, None if tested else found[-1].untested or Untested.SINGULAR
+
+
+def with_findings(course: SegmentCourse, band: Band, dims: tuple[int, ...]) -> SegmentCourse:
+    """Return segments with what they show by their averages, of which octaves have a part."""
+    bins = np.searchsorted(band.frequencies, band.settings.frequencies[course.bins])
+    found = steadiness(band, dims, replace(course, bins=bins))
+    if found is None or found.single is None:
+        return replace(course, findings=SegmentFindings.none(len(course.spectra), dims))
+    return replace(course, findings=found.single)
 
 
 def steadiness(band: Band, dims: tuple[int, ...], course: SegmentCourse | None) -> Stability | None:
@@ -442,12 +456,20 @@ def steadiness(band: Band, dims: tuple[int, ...], course: SegmentCourse | None) 
 
 
 def _counts(
-    advice: Advice, by: Diagnostics, clearest: Diagnostics, stability: Stability | None
+    advice: Advice,
+    by: Diagnostics,
+    clearest: Diagnostics,
+    found: Sequence[Diagnostics],
+    stability: Stability | None,
 ) -> bool:
     """Whether advice of one octave counts among those of all."""
-    if isinstance(advice, ResponseChanges) and stability is not None and by.stability is not None:
+    if isinstance(advice, ResponseChanges) and stability is not None:
         (sensor,) = advice.sensors
-        return any(c.sensor == sensor and c in by.stability.changes for c in stability.changes)
+        change = next((each for each in stability.changes if each.sensor == sensor), None)
+        of_it = (e for e in found if e.stability is not None and change in e.stability.changes)
+        return by is next(of_it, None)
+    if isinstance(advice, DisturbedSegments):
+        return by is next(e for e in reversed(found) if e.stability is not None)
     return by is clearest or not advice.sensors or isinstance(advice, NoiseChanges)
 
 

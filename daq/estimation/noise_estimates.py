@@ -146,6 +146,14 @@ def averages(passes: Sequence[Pass]) -> tuple[Band, ...]:
     return (known_part(band, usable),)
 
 
+def shortest_segments(passes: Sequence[Pass]) -> Band | None:
+    """Return averages of the shortest segments at frequencies of all octaves; None without."""
+    octaves = _octaves(passes)
+    if octaves is None or not octaves.n_segments:
+        return None
+    return known_part(octaves.top(), min(each.aligned.usable for each in passes))
+
+
 def _parts(passes: Sequence[Pass]) -> Parts | None:
     """Return the averages of all recordings in parts of time; None unless all have them."""
     found = [each.parts for each in passes]

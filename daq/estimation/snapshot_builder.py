@@ -30,6 +30,7 @@ from daq.estimation.diagnosis import (
     diagnosis,
     last_aligned,
     synchronisation,
+    with_findings,
 )
 from daq.estimation.equalisation import METHOD, Equalisation
 from daq.estimation.linearity import linearised, nonlinear_channels
@@ -52,6 +53,7 @@ from daq.estimation.noise_estimates import (
     rejected_segments,
     responses,
     rounded_alike,
+    shortest_segments,
     with_sets,
 )
 from daq.estimation.recording_set import is_complete, left_open
@@ -109,6 +111,7 @@ def segment_course(
         if each.single is None or each.n_bridged:
             return None
         some = kept_rows(len(each.single), every // each.single.every)
+        some = some[np.argsort(each.kept_at[some])]  # those held back are taken late
         found, at = each.single.values()[some], each.kept_at[some]
         later = (each.aligned.start_utc_ns - origin) * 1e-9
         spectra.append(found)
@@ -459,6 +462,12 @@ class SnapshotBuilder:
         dims, channels = passes[0].aligned.dims, passes[0].aligned.channels
         counts = limits_by_column([(each.recording, each.unused()) for each in passes], channels)
         stood_still = still_for_a_while(passes, self._settings)
+        course = segment_course(passes, channels, self._unit, self._equalisation)
+        whole = None if course is None else shortest_segments(passes)
+        if course is not None and whole is not None:
+            filters = self._equalisation.response(whole.frequencies)
+            whole = in_units(whole, channels, self._unit, filters)
+            course = with_findings(course, whole, dims)
         found = diagnosis(
             bands,
             dims,
@@ -467,7 +476,7 @@ class SnapshotBuilder:
             faulty={*counts.faulty, *stood_still},
             axes=self._axes,
             aligned=aligned_pairs(clock_states(passes)),
-            course=segment_course(passes, channels, self._unit, self._equalisation),
+            course=course,
             maxima=maxima,
         )
         edges = self._equalisation.leakage(raw, channels, self._unit)

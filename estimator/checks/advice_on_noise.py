@@ -130,13 +130,13 @@ class DisturbedSegments(Advice):
         much = f"up to {percent(self.excess)} " if is_known else ""
         return Words(
             f"{several(self.n_disturbed, 'disturbed segment')}, most in "
-            f"{names.channels[self.channel]}: noise {much}too high; use --reject",
+            f"{names.channels[self.channel]}: noise {much}too high; use --reject or --exclude",
             f"{self.n_disturbed} of {self.n_segments} segments "
             f"{'differ' if self.n_disturbed > 1 else 'differs'} from all others in what is "
             f"no common motion, most in {names.channels[self.channel]} (from the start: {times}"
             f"{f' and {more} more' if more else ''})."
             + (f" They add {much}to the noise." if much else ""),
-            "Exclude disturbed segments (--reject).",
+            "Exclude disturbed segments (--reject), or stretches of time (--exclude).",
         )
 
 

@@ -43,12 +43,15 @@ class SegmentCourse:
         Start time of each segment, s.
     runs : int64, shape (n_segments,)
         Index of each segment's recording, from 0.
+    findings : SegmentFindings or None
+        What they show, where averages of the same segments told; else those that are tested do.
     """
 
     spectra: NDArray[np.complexfloating]
     bins: IntArray
     times: FloatArray
     runs: IntArray
+    findings: SegmentFindings | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +69,8 @@ class SegmentFindings:
         Gains and turns that change within parts of time.
     loudness : Loudness
         Of the noise.
+    band, time : tuple of (float, float)
+        Frequencies in Hz, and time in s, in which they were tested.
     """
 
     disturbed: BoolArray
@@ -73,6 +78,8 @@ class SegmentFindings:
     is_restless: bool
     gains: tuple[UnsteadyGain, ...]
     loudness: Loudness
+    band: tuple[float, float] = (0.0, 0.0)
+    time: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def none(cls, n_segments: int, dims: tuple[int, ...]) -> SegmentFindings:
@@ -94,6 +101,9 @@ def segment_findings(
     Where noise changes all the time, at some frequencies, or gains do, segments are not disturbed.
     """
     none = SegmentFindings.none(len(course.spectra), dims)
+    if course.findings is not None:
+        is_same = course.findings.excess.shape[1] == sum(dims)
+        return course.findings if is_same else none
     known = np.flatnonzero(course.bins < len(good))
     known = known[(maximum.converged & ~maximum.singular)[course.bins[known]]]
     is_good = good[course.bins[known]]

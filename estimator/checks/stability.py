@@ -163,6 +163,8 @@ class Stability:
     steadied : tuple of Steadied or None
         Averages without the changes of responses, of each range of frequencies; None where nothing
         tells of any.
+    single : SegmentFindings or None
+        What single segments show, of the channels that move.
     """
 
     low: FloatArray = field(metadata={"key": "low_hz"})
@@ -182,6 +184,7 @@ class Stability:
     is_restless: bool = field(default=False, metadata=NOT_IN_JSON)
     loudness: Loudness | None = field(default=None, metadata=NOT_IN_JSON)
     steadied: tuple[Steadied | None, ...] = field(default=(), metadata=NOT_IN_JSON)
+    single: SegmentFindings | None = field(default=None, metadata=NOT_IN_JSON)
 
     @property
     def inflation(self) -> float:
@@ -202,9 +205,12 @@ class Stability:
         alarm = FALSE_ALARM / (LONG_TAILS * n_sensors * len(found))
         seen = Counter(change.sensor for each in found for change in each.changes)
         clearest: dict[int, ResponseChange] = {}
+        unsteady = {gain.sensor for each in found if each.single for gain in each.single.gains}
         is_added, second_order = False, 0.0
         for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
             most = critical_value(each.degrees, alarm) + second_order
+            if each.sensor in unsteady:  # single segments are tested once
+                most = 0.0
             if each.sensor in clearest or each.statistic <= most:
                 continue
             is_added = True
@@ -405,20 +411,17 @@ def stability(
             dims=dims,
             time=(begin, end),
         )
-    single = (
-        segment_findings(course, maximum, good, dims, begin)
-        if course is not None and len(course.spectra) >= MIN_SEGMENTS * MIN_PARTS
-        else SegmentFindings.none(0, dims)
-    )
+    single = _of_segments(course, maximum, good, dims, begin)
+    if course is not None and course.findings is None:
+        span, time = (float(low[0]), float(high[-1])), (float(begin[0]), float(end[-1]))
+        single = replace(single, band=span, time=time)
     loudness = single.loudness.joined(Loudness.of_parts(parts, maximum, psd, good))
     changes, added, left = _and_unstable(
         (changes, added),
         single,
         maximum,
         [inside & maximum.converged & ~maximum.singular for inside in insides],
-        edges=(low, high),
-        dims=dims,
-        time=(begin, end),
+        dims,
     )
     explained = np.maximum(explained, left)
     without = (
@@ -461,7 +464,21 @@ def stability(
         is_restless=single.is_restless,
         loudness=loudness,
         steadied=() if without is None else (without,),
+        single=single,
     )
+
+
+def _of_segments(
+    course: SegmentCourse | None,
+    maximum: Maximum,
+    good: BoolArray,
+    dims: tuple[int, ...],
+    begin: FloatArray,
+) -> SegmentFindings:
+    """Return what single segments show, if there are enough."""
+    if course is None or len(course.spectra) < MIN_SEGMENTS * MIN_PARTS:
+        return SegmentFindings.none(0, dims)
+    return segment_findings(course, maximum, good, dims, begin)
 
 
 def _are_close(frequency: FloatArray, step: float) -> bool:
@@ -490,10 +507,7 @@ def _and_unstable(
     single: SegmentFindings,
     maximum: Maximum,
     insides: Sequence[BoolArray],
-    *,
-    edges: tuple[FloatArray, FloatArray],
     dims: tuple[int, ...],
-    time: tuple[FloatArray, FloatArray],
 ) -> tuple[tuple[ResponseChange, ...], FloatArray, FloatArray]:
     """Return changes with those of gains that change within parts of time, in their place.
 
@@ -512,8 +526,7 @@ def _and_unstable(
     if np.isnan(left).all():
         return changes, added, np.zeros_like(left)
     left = np.where(np.isnan(left), np.nanmax(left, axis=0), left)
-    begin, end = float(time[0][0]), float(time[1][-1])
-    band = float(edges[0][0]), float(edges[1][-1])
+    begin, end = single.time
     for each in single.gains:
         own = [a for a, _, _ in each.pairs]
         if left[:, own].max() <= LEAST_LEFT:
@@ -530,7 +543,7 @@ def _and_unstable(
             end=end,
             statistic=each.sure**2,
             degrees=1.0,
-            band=band,
+            band=single.band,
         )
         changes = (change, *(e for e in changes if e.sensor != each.sensor))
         added = np.maximum(added, each.added(nothing + 1))

@@ -27,7 +27,7 @@ from estimator.records import dataclass
 from estimator.spectra.channel_sets import ChannelSets
 from estimator.spectra.parts import Part, PartEnds, Parts, by_part
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
-from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings, kept_bins
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 Columns = tuple[int, ...]
@@ -82,6 +82,8 @@ class MultiResolution:
         shortest.
     rejection : RejectionSettings, optional
         Criteria for disturbed segments; default: only incomplete segments are excluded.
+    segments : SegmentSpectra, optional
+        Receives the spectra of single segments of the top stage, as of `CrossSpectra`.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class MultiResolution:
         *,
         n_stages: int,
         rejection: RejectionSettings | None = None,
+        segments: SegmentSpectra | None = None,
     ) -> None:
         if n_stages < 1:
             raise EstimatorError(f"{n_stages} stages: at least one is needed")
@@ -103,6 +106,7 @@ class MultiResolution:
                 replace(settings, sampling_rate=settings.sampling_rate / 2**level),
                 n_channels,
                 rejection,
+                segments if level == 0 else None,
             )
             for level in range(n_stages)
         ]
@@ -257,12 +261,39 @@ class MultiResolution:
             )
         return tuple(bands)
 
+    def top(self) -> Band:
+        """Return the averages of the shortest segments, at some of all their frequencies.
+
+        Among these are `estimator.spectra.welch.kept_bins`.
+
+        Raises
+        ------
+        InsufficientDataError
+            If there is no segment.
+        """
+        stage = self._stages[0]
+        spectra, frequencies = stage.total(), stage.settings.frequencies
+        inside = np.isin(np.arange(len(frequencies)), kept_bins(len(frequencies)))
+        inside[stage.kept] = True
+        return Band(
+            stage.settings,
+            frequencies[inside],
+            spectra.csm()[inside],
+            spectra.n_segments,
+            spectra.n_effective,
+            parts=stage.parts(inside, np.ones(int(inside.sum()))),
+        )
+
 
 class _Stage:
     """Adds segments at one rate, and computes the samples of the next stage."""
 
     def __init__(
-        self, settings: WelchSettings, n_channels: int, rejection: RejectionSettings | None
+        self,
+        settings: WelchSettings,
+        n_channels: int,
+        rejection: RejectionSettings | None,
+        segments: SegmentSpectra | None,
     ) -> None:
         self.settings = settings
         self.n_channels = n_channels
@@ -272,11 +303,11 @@ class _Stage:
         self._ends = PartEnds(_kept_in_parts(len(settings.frequencies)))
         self._n_seen = 0
         self._parts: tuple[Part, ...] = ()  # of other recordings
-        self._spectra = CrossSpectra(settings, n_channels, ends=self._ends)
+        self._spectra = CrossSpectra(settings, n_channels, segments=segments, ends=self._ends)
         self._undisturbed: SelectedSpectra | None = None
         if rejection is not None:
             self._undisturbed = SelectedSpectra(
-                settings, n_channels, rejection=rejection, ends=self._ends
+                settings, n_channels, rejection=rejection, segments=segments, ends=self._ends
             )
         self.sets = ChannelSets(settings, short=0.0, rejection=rejection)
         self._total: CrossSpectra | None = None
@@ -317,6 +348,11 @@ class _Stage:
         """Return numbers of the segments with transients, and the channel with the largest."""
         found = () if self._undisturbed is None else self._undisturbed.all_rejected()
         return [(each.segment, each.channel) for each in found if each.channel is not None]
+
+    @property
+    def kept(self) -> IntArray:
+        """Frequencies that are kept in parts."""
+        return self._ends.bins
 
     def _own_parts(self) -> tuple[Part, ...]:
         """Return the averages of the accepted segments in parts of time."""
@@ -363,10 +399,7 @@ class _Stage:
         sums = self._spectra if self._undisturbed is None else self._undisturbed
         places = self._n_seen + np.flatnonzero(whole)
         for part in by_part(sums, places):
-            if isinstance(sums, SelectedSpectra):
-                sums.add(self._samples, starts[whole][part], numbers=places[part])
-            else:
-                sums.add(self._samples, starts[whole][part])
+            sums.add(self._samples, starts[whole][part], places=places[part])
         self._n_seen += n
         self._total = None
         if not whole.all():

@@ -28,7 +28,7 @@ from estimator.errors import EstimatorError
 from estimator.median import median
 from estimator.records import dataclass
 from estimator.spectra.parts import PartEnds
-from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from estimator.types import FloatArray, IntArray
 
@@ -116,8 +116,9 @@ class SelectedSpectra:
     settings : WelchSettings
     n_channels : int
     rejection : RejectionSettings, optional
-    ends : PartEnds, optional
-        As of `CrossSpectra`. Segments of a start-up set are in the part in which it ends.
+    segments, ends : SegmentSpectra and PartEnds, optional
+        As of `CrossSpectra`, of accepted segments. Those of a start-up set are in the part in which
+        it ends.
 
     Attributes
     ----------
@@ -135,6 +136,7 @@ class SelectedSpectra:
         n_channels: int,
         *,
         rejection: RejectionSettings | None = None,
+        segments: SegmentSpectra | None = None,
         ends: PartEnds | None = None,
     ) -> None:
         self.settings = settings
@@ -142,7 +144,7 @@ class SelectedSpectra:
         self.n_segments = 0
         self.counts: Counter[Reason] = Counter()
         self.rejected: deque[Rejected] = deque(maxlen=REPORTED)
-        self._accepted = CrossSpectra(settings, n_channels, ends=ends)
+        self._accepted = CrossSpectra(settings, n_channels, segments=segments, ends=ends)
         self._window = get_window(settings.window, settings.segment_length)[:, None]
         n_freqs = settings.segment_length // 2 + 1
         octaves = int(np.log2(max(1, n_freqs // FIRST_BAND)))
@@ -165,7 +167,7 @@ class SelectedSpectra:
         samples: FloatArray,
         starts: IntArray,
         *,
-        numbers: IntArray | None = None,
+        places: IntArray | None = None,
     ) -> None:
         """Test the segments of `samples` that begin at `starts`, and add the accepted ones.
 
@@ -175,8 +177,8 @@ class SelectedSpectra:
             NaN counts as a gap.
         starts : int64, shape (n_segments,)
             In order of time.
-        numbers : int64, shape (n_segments,), optional
-            By which excluded segments are known; default: how many were tested before.
+        places : int64, shape (n_segments,), optional
+            Numbers in time of the segments; default: how many were tested before.
 
         Raises
         ------
@@ -185,30 +187,32 @@ class SelectedSpectra:
         """
         starts = np.asarray(starts, dtype=np.int64)
         self._accepted.check(samples, starts)
-        if numbers is None:
-            numbers = self.n_segments + np.arange(len(starts))
+        if places is None:
+            places = self.n_segments + np.arange(len(starts))
         self.n_segments += len(starts)
-        passed = []
+        passed: list[tuple[int, int]] = []
         for first in range(0, len(starts), SEGMENTS_PER_BLOCK):
             some = slice(first, first + SEGMENTS_PER_BLOCK)
-            tested = zip(starts[some], numbers[some], strict=True)
+            tested = zip(starts[some].tolist(), places[some].tolist(), strict=True)
             levels_of = self._levels(samples, starts[some])
             for (row, number), levels in zip(tested, levels_of, strict=True):
                 stretch = slice(row, row + self.settings.segment_length)
                 whole = bool(np.isfinite(levels).all())
-                if self._passes(int(number), samples[stretch], levels, whole=whole):
-                    passed.append(row)
-        self._accepted.add(samples, np.array(passed, dtype=np.int64))
+                if self._passes(number, samples[stretch], levels, whole=whole):
+                    passed.append((row, number))
+        rows, numbers = np.array(passed, dtype=np.int64).reshape(-1, 2).T
+        self._accepted.add(samples, rows, places=numbers)
 
     def spectra(self) -> CrossSpectra:
         """Return the spectra of all segments accepted so far.
 
-        Includes the segments held back that agree with each other.
+        Includes the segments held back that agree with each other, but for single spectra.
         """
         total = CrossSpectra(self.settings, self._accepted.n_channels, ends=self.ends)
         total.merge(self._accepted)
         for held in self._agreeing(self._held)[0]:
             total.add(held.samples, np.zeros(1, dtype=np.int64))
+        total.segments = self._accepted.segments
         return total
 
     def all_rejected(self) -> list[Rejected]:
@@ -224,13 +228,17 @@ class SelectedSpectra:
         """End a part of time before this place of the segments."""
         self._accepted.end_part(place)
 
-    def drain(self, ends: PartEnds | None = None) -> CrossSpectra:
+    def drain(
+        self, *, segments: SegmentSpectra | None = None, ends: PartEnds | None = None
+    ) -> CrossSpectra:
         """Return the spectra of segments accepted since the last call, and keep all criteria.
 
-        Segments held back are returned by a later call. `ends` are those of the next ones.
+        Segments held back are returned by a later call. `segments` and `ends` are of the next ones.
         """
         accepted = self._accepted
-        self._accepted = CrossSpectra(self.settings, accepted.n_channels, ends=ends)
+        self._accepted = CrossSpectra(
+            self.settings, accepted.n_channels, segments=segments, ends=ends
+        )
         return accepted
 
     def _levels(self, samples: FloatArray, rows: IntArray) -> FloatArray:
@@ -280,7 +288,8 @@ class SelectedSpectra:
     def _end_start_up(self) -> None:
         agreeing, others = self._agreeing(self._held)
         for held in agreeing:
-            self._accepted.add(held.samples, np.zeros(1, dtype=np.int64))
+            at = np.array([held.number])
+            self._accepted.add(held.samples, np.zeros(1, dtype=np.int64), places=at)
             self._before.append(held.levels)
         for rejected in others:
             self._leave_out(rejected)

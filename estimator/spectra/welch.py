@@ -150,7 +150,7 @@ class CrossSpectra:
         self._trend_bins = slice(0, _last_bin(spectra))
         self._trend_spectra = spectra[self._trend_bins]
 
-    def add(self, samples: FloatArray, starts: IntArray) -> None:
+    def add(self, samples: FloatArray, starts: IntArray, *, places: IntArray | None = None) -> None:
         """Add the segments of `samples` that begin at `starts`.
 
         Parameters
@@ -159,6 +159,8 @@ class CrossSpectra:
             In physical units. Samples outside all segments have no effect.
         starts : int64, shape (n_segments,)
             Row of `samples` at which each segment begins.
+        places : int64, shape (n_segments,), optional
+            As of `SegmentSpectra.add`.
 
         Raises
         ------
@@ -169,9 +171,16 @@ class CrossSpectra:
         starts = np.asarray(starts, dtype=np.int64)
         self.check(samples, starts)
         for spectra in self._transformed(samples, starts, self._work):
-            self._add(spectra)
+            own, places = (None, None) if places is None else np.split(places, [len(spectra)])
+            self._add(spectra, own)
 
-    def add_spectra(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
+    def add_spectra(
+        self,
+        spectra: ComplexArray,
+        products: FloatArray | None = None,
+        *,
+        places: IntArray | None = None,
+    ) -> None:
         """Add segments by their spectra.
 
         Parameters
@@ -180,6 +189,8 @@ class CrossSpectra:
             Transforms of windowed samples without trend, in physical units.
         products : float64, shape (n_freqs, 2 * n_channels, 2 * n_channels), optional
             What `products` returned of the same spectra.
+        places : int64, shape (n_segments,), optional
+            As of `add`.
 
         Raises
         ------
@@ -192,12 +203,17 @@ class CrossSpectra:
                 f"spectra of shape {spectra.shape}, expected (n_segments, {n_freqs}, {n_channels})"
             )
         if len(spectra):
-            self._add(spectra, products)
+            self._add(spectra, places, products)
 
-    def _add(self, spectra: ComplexArray, products: FloatArray | None = None) -> None:
+    def _add(
+        self,
+        spectra: ComplexArray,
+        places: IntArray | None,
+        products: FloatArray | None = None,
+    ) -> None:
         self._products.add(spectra, products)
         if self.segments is not None:
-            self.segments.add(spectra[:, self.segments.bins])
+            self.segments.add(spectra[:, self.segments.bins], places)
         self.n_segments += len(spectra)
 
     def products(self, spectra: ComplexArray, out: FloatArray | None = None) -> FloatArray | None:
@@ -208,14 +224,16 @@ class CrossSpectra:
         """
         return self._products.gram(spectra, out)
 
-    def add_products(self, products: FloatArray, single: NDArray[np.complex64]) -> None:
+    def add_products(
+        self, products: FloatArray, single: NDArray[np.complex64], *, places: IntArray
+    ) -> None:
         """Add segments as `add_spectra` does, by what `products` returned of them.
 
         `single` are their spectra at the bins of `segments`, which must be kept.
         """
         self._products.add_gram(products)
         if self.segments is not None:
-            self.segments.add(single)
+            self.segments.add(single, places)
         self.n_segments += len(single)
 
     def check(self, samples: FloatArray, starts: IntArray) -> None:
@@ -641,6 +659,8 @@ class SegmentSpectra:
         One of so many segments is kept (`kept_rows`).
     most : int
         Maximum number of kept segments.
+    places : int64, shape (n_segments,)
+        Numbers in time of those kept.
     """
 
     def __init__(self, bins: IntArray, n_channels: int) -> None:
@@ -651,15 +671,21 @@ class SegmentSpectra:
         self._n_seen = 0
         self._kept = np.empty((0, len(bins), n_channels), np.complex64)
         self._n_kept = 0
+        self.places: IntArray = np.empty(0, np.int64)
 
-    def add(self, spectra: ComplexArray | NDArray[np.complex64]) -> None:
+    def add(
+        self, spectra: ComplexArray | NDArray[np.complex64], places: IntArray | None = None
+    ) -> None:
         """Add the spectra of segments, in order of time.
 
         Parameters
         ----------
         spectra : complex, shape (n_segments, n_kept, n_channels)
+        places : int64, shape (n_segments,), optional
+            Their numbers in time; default: how many were added before.
         """
         first = self._n_seen
+        places = first + np.arange(len(spectra)) if places is None else places
         self._n_seen += len(spectra)
         while len(kept := kept_rows(self._n_seen, self.every)) > self.most:
             self.thin(2 * self.every)
@@ -672,6 +698,7 @@ class SegmentSpectra:
             room[: self._n_kept] = self.values()
             self._kept = room
         self._kept[self._n_kept : end] = spectra[kept]
+        self.places = np.concatenate([self.places, places[kept]])
         self._n_kept = end
 
     def __len__(self) -> int:
@@ -681,7 +708,8 @@ class SegmentSpectra:
     def thin(self, every: int) -> None:
         """Keep one of `every` segments from now on, a multiple of the current value."""
         if every != self.every:
-            self._kept = self.values()[kept_rows(self._n_kept, every // self.every)]
+            some = kept_rows(self._n_kept, every // self.every)
+            self._kept, self.places = self.values()[some], self.places[some]
             self._n_kept = len(self._kept)
             self.every = every
 

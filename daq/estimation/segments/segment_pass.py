@@ -39,9 +39,14 @@ from estimator.spectra.welch import (
     SegmentSpectra,
     WelchSettings,
     kept_bins,
-    kept_rows,
 )
-from estimator.spectra.windows import WindowLeakage, gap_window, get_window, without_trend
+from estimator.spectra.windows import (
+    WindowLeakage,
+    effective_averages,
+    gap_window,
+    get_window,
+    without_trend,
+)
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -238,20 +243,22 @@ class Pass:
         rejection = RejectionSettings() if wanted.reject else None
         self.octaves: MultiResolution | None = None
         self._undisturbed: SelectedSpectra | None = None
+        kept = kept_bins(len(self.welch.frequencies))
+        self.single: SegmentSpectra | None = SegmentSpectra(kept, self.n_channels)
         if wanted.octaves:
             self.octaves = MultiResolution(
                 self.welch,
                 self.n_channels,
                 n_stages=OCTAVES,
                 rejection=rejection,
+                segments=self.single,
             )
         bins = part_bins(len(self.welch.frequencies), self.n_channels)
         self._ends = None if wanted.octaves else PartEnds(bins)
         if wanted.reject and not wanted.octaves:
-            self._undisturbed = SelectedSpectra(self.welch, self.n_channels, ends=self._ends)
-        single = SegmentSpectra(kept_bins(len(self.welch.frequencies)), self.n_channels)
-        self.single = None if wanted.octaves or wanted.reject else single
-        self._kept_at = GrowingRows(np.int64)
+            self._undisturbed = SelectedSpectra(
+                self.welch, self.n_channels, segments=self.single, ends=self._ends
+            )
         self._all = CrossSpectra(self.welch, self.n_channels, segments=self.single, ends=self._ends)
         self._selected: CrossSpectra | None = None
         self._bridge: GapBridge | None = None
@@ -321,8 +328,7 @@ class Pass:
         """Return the spectra since the last call; none with octaves.
 
         Segments held back for judgement are among the next ones, unless these are the last. `ends`
-        receives the sums of the next ones at the ends of parts, `segments` their spectra where none
-        is held back.
+        receives the sums of the next ones at the ends of parts, `segments` their spectra.
         """
         self._ends = None  # the sums begin again: no parts of the recording are kept of them
         if self._undisturbed is None:
@@ -330,7 +336,9 @@ class Pass:
             self._all = CrossSpectra(self.welch, self.n_channels, ends=ends, segments=segments)
             return spectra
         self._selected = None
-        return self._undisturbed.spectra() if last else self._undisturbed.drain(ends)
+        if last:
+            return self._undisturbed.spectra()
+        return self._undisturbed.drain(segments=segments, ends=ends)
 
     def end_part(self, place: int) -> None:
         """End a part before the segment with this number, where one is due."""
@@ -372,8 +380,8 @@ class Pass:
     @property
     def kept_at(self) -> NDArray[np.int64]:
         """Grid samples at which the segments of `single` begin."""
-        at = self._kept_at.values
-        return at if self.single is None else at[kept_rows(len(at), self.single.every)]
+        places = np.empty(0, np.int64) if self.single is None else self.single.places
+        return self.reach + places * self.welch.hop
 
     @property
     def n_complete(self) -> int:
@@ -525,8 +533,7 @@ class Pass:
         begins = self.reach + numbers * self.welch.hop
         self.stillness.counts += part.still
         for _ in by_part(self._all, numbers):  # one: the piece lies in one part of time
-            self._all.add_products(part.products, part.single[:count])
-        self._kept_at.add(begins)
+            self._all.add_products(part.products, part.single[:count], places=numbers)
         self._n_taken += count
         self._taken_at.add(self._positions(numbers))
         if self._delays.measures:
@@ -706,11 +713,7 @@ class Pass:
         sums = self._all if self._undisturbed is None else self._undisturbed
         places = (first + starts - self.reach) // self.welch.hop
         for some in by_part(sums, places):
-            if isinstance(sums, SelectedSpectra):
-                sums.add(samples, starts[some], numbers=places[some])
-            else:
-                sums.add(samples, starts[some])
-        self._kept_at.add(first + starts)
+            sums.add(samples, starts[some], places=places[some])
         self._selected = None
 
     def _take_whole(
@@ -720,10 +723,10 @@ class Pass:
         products: FloatArray | None = None,
     ) -> None:
         """Add segments by their spectra and products; they begin at grid samples `begins`."""
-        for some in by_part(self._all, (begins - self.reach) // self.welch.hop):
-            taken = spectra[some]
-            self._all.add_spectra(taken, products if len(taken) == len(spectra) else None)
-        self._kept_at.add(begins)
+        places = (begins - self.reach) // self.welch.hop
+        for some in by_part(self._all, places):
+            taken, own = spectra[some], products if len(places[some]) == len(places) else None
+            self._all.add_spectra(taken, own, places=places[some])
 
     def _take_samples(self, part: _Samples, first: int, count: int, *, together: bool) -> None:
         """Add segments from samples on the grid; `first` is the number of the first of them."""
@@ -955,7 +958,8 @@ class Pass:
         """Return whether stated UTC was found to drift only now; then all begins again."""
         sensors = self.aligned.stated
         if len(sensors) > 1 and self.single is not None and self._settings.clocks == "refined":
-            n_effective = self._all.n_effective if len(self.single) else 0.0
+            window = get_window(self.welch.window, self.welch.segment_length)
+            n_effective = effective_averages(window, self.welch.hop, max(self.n_segments, 1))
             if agree(self.aligned, self.single, self.kept_at, self.welch, n_effective=n_effective):
                 self.aligned.compare_stated(dict.fromkeys(sensors, 0.0), sensors[0])
                 return False

@@ -110,12 +110,15 @@ def test_levels_within_parts_are_those_of_a_steady_bench(kind: str, most: float)
     assert snapshot.n_effective < 420  # of 455: every part has spent three
 
 
-def test_a_tap_as_loud_as_the_motion_names_the_sensor_and_opens_its_interval() -> None:
+@pytest.mark.parametrize("octaves", [False, True])
+def test_a_tap_as_loud_as_the_motion_names_the_sensor_and_opens_its_interval(
+    *, octaves: bool
+) -> None:
     """It is taken for motion: the model failed, and "move them closer" was all that was said."""
     samples = recorded("steady", 3)
     begin = int(0.6 * N)
     samples["B"][begin : begin + 20] += 300 * np.random.default_rng(9).standard_normal((20, 3))
-    snapshot = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    snapshot = huddle.self_noise(samples, fs=RATE, segment="5s", octaves=octaves).snapshot
     (found,) = [e for e in snapshot.diagnostics.advice if isinstance(e, DisturbedSegments)]
     assert snapshot.channels[found.channel].sensor == "B"
     assert begin / RATE - 5 < found.times[0] < begin / RATE + 1
@@ -220,18 +223,20 @@ def test_of_few_averages_a_change_is_named_and_opens_the_interval(*, octaves: bo
 
 
 @pytest.mark.parametrize(
-    ("kind", "channel", "least", "ratio"),
+    ("kind", "channel", "least", "ratio", "option"),
     [
-        ("jitter", None, 0.01, 1e4),  # of segments of 5 s, weighted by the window
-        ("jitter", None, 0.01, 1e6),
-        ("halves", 3, 0.02, 1e4),
+        ("jitter", None, 0.01, 1e4, ""),  # of segments of 5 s, weighted by the window
+        ("jitter", None, 0.01, 1e6, ""),
+        ("halves", 3, 0.02, 1e4, ""),
+        ("halves", 3, 0.02, 1e4, "octaves"),
+        ("halves", 3, 0.02, 1e4, "reject"),
     ],
 )
 def test_a_gain_that_changes_within_parts_bounds_its_noise(
-    kind: str, channel: int | None, least: float, ratio: float
+    kind: str, channel: int | None, least: float, ratio: float, option: str
 ) -> None:
     """Parts of time do not show it: noise of B was 7 and 26 dB too high in silence."""
-    snapshot = estimated(kind, 1, ratio=ratio)
+    snapshot = estimated(kind, 1, ratio=ratio, option=option)
     (change,) = changes(snapshot)
     assert change.sensors == (1,)
     assert change.channel == channel

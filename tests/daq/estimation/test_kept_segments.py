@@ -12,7 +12,8 @@ def _recordings(n_recordings: int, n_segments: int) -> list[SegmentSpectra]:
     kept = []
     for _ in range(n_recordings):
         spectra = SegmentSpectra(np.array([2]), 1)
-        spectra.add(np.arange(n_segments, dtype=np.complex128).reshape(-1, 1, 1))
+        values = np.arange(n_segments)
+        spectra.add(values.reshape(-1, 1, 1) + 0j, values)
         kept.append(spectra)
         keep_few(kept)
     return kept

@@ -221,10 +221,11 @@ def test_kept_segments_are_bounded_in_number() -> None:
     kept = SegmentSpectra(bins[:1], 1)
     n = 2 * MAX_SEGMENTS + 5
     for part in np.array_split(np.arange(n, dtype=np.complex128), 7):
-        kept.add(part[:, None, None])
+        kept.add(part[:, None, None], part.real.astype(np.int64))
     assert kept.every == 4
     found = kept.values()[:, 0, 0].real
     assert np.array_equal(found, kept_rows(n, 4))
+    assert np.array_equal(found, kept.places)
     assert np.array_equal(found // 4, np.arange(len(found)))
     # a change of the period of eight segments is met at each phase
     assert np.bincount(found.astype(np.int64) % 8).min() > MAX_SEGMENTS / 40

@@ -7,7 +7,7 @@ import pytest
 
 from estimator.errors import EstimatorError
 from estimator.spectra.segment_rejection import Reason, RejectionSettings, SelectedSpectra
-from estimator.spectra.welch import CrossSpectra, WelchSettings
+from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings
 
 SETTINGS = WelchSettings(50.0, 200)
 CHANNELS = 4
@@ -95,11 +95,14 @@ def test_decisions_do_not_depend_on_later_samples_or_their_division() -> None:
         part = selected(samples[: starts[n - 1] + 200], starts[:n])
         if n >= RejectionSettings().start_up:
             assert list(part.rejected) == [r for r in whole.rejected if r.segment < n]
-    live = SelectedSpectra(SETTINGS, CHANNELS)
+    single = SegmentSpectra(np.arange(3), CHANNELS)
+    live = SelectedSpectra(SETTINGS, CHANNELS, segments=single)
     for some in np.array_split(starts, 37):
         live.add(samples[some[0] : some[-1] + 200], some - some[0])
         assert live.spectra().n_segments + sum(live.counts.values()) <= live.n_segments
     assert list(live.rejected) == list(whole.rejected)
+    kept = np.delete(np.arange(200), [each.segment for each in live.rejected])
+    assert np.array_equal(np.sort(single.places), kept)
     np.testing.assert_allclose(live.spectra().csm(), whole.spectra().csm(), rtol=1e-11, atol=1e-14)
 
 
