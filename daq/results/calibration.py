@@ -16,6 +16,8 @@ from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
 from estimator.checks.shared_motion import CanonicalCoherence
 from estimator.errors import InsufficientDataError
+from estimator.levels.bands import band_edges
+from estimator.levels.contributions import Source
 from estimator.responses.calibration import CommonMotion
 from estimator.responses.derived_quantities import Value
 from estimator.responses.edge_leakage import channel_responses, slope_factor
@@ -35,6 +37,10 @@ if TYPE_CHECKING:
 CONFIDENCE = 0.95
 BANDS_PER_OCTAVE = 1
 _RECTANGULAR = math.sqrt(3.0)
+_SHARED = {Source.MISFIT, Source.SHARED_NOISE, Source.COUNTS}
+"""Contributions to noise by what sensors share beside the motion."""
+_FOLLOWING = {Source.LINEARITY, Source.OF_MOTION}
+"""By noise that follows the motion of the channel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,6 +138,7 @@ def calibrate(
             refused[sensor] = str(error)
             continue
         budgets += work.sensitivities(sensors[-1])
+        sensors[-1] = work.widened(sensors[-1], budgets[-len(found.scatter) :])
         for low, high in work.octaves():
             try:
                 budgets += work.sensitivities(work.motion.calibrated(sensor, (low, high)))
@@ -244,27 +251,32 @@ class _Work:
         jitter = math.hypot(
             *(known(residual.get(names[each], 0.0)) for each in (found.sensor, found.reference))
         )
-        variation, n = math.sqrt(max(found.excess**2 - 1, 0.0)), max(found.n_frequencies - 1, 1)
+        n = max(found.n_frequencies - 1, 1)
+        shared, following = self._unmodelled((found.low, found.high))
         clocks = omega_squared * jitter**2 / 2 / _RECTANGULAR
         budgets = []
         for number, column in enumerate(self._columns(found.sensor)):
             sensor, name = self._key(column)
             channel = self._known.get((sensor, name))
             gain = float(found.gain.value[number])
-            scatter = float(found.gain.error[number]) / gain
+            scatter = float(found.scatter[number]) / gain
+            variation = math.sqrt(
+                max((float(found.gain.error[number]) / gain) ** 2 - scatter**2, 0)
+            )
             bent = self._bending[inside, column]
             bent = bent[np.isfinite(bent)]
             leakage = float(abs(np.mean(bent.real))) / _RECTANGULAR if bent.size else 0.0
             components = [
                 Component("estimate", "A", "normal", scatter, found.dof),
-                Component("variation", "A", "normal", scatter * variation, float(n)),
+                Component("variation", "A", "normal", variation, float(n)),
                 Component("clocks", "B", "rectangular", clocks),
                 Component("leakage", "B", "rectangular", leakage),
                 Component("quantisation", "B", "rectangular", self._counting(column, inside)),
             ]
             further = {
                 "drift": self._drift(column),
-                "linearity": self._nonlinearity(column, inside),
+                "linearity": max(self._nonlinearity(column, inside), self._with(column, following)),
+                "misfit": self._with(column, shared) / _RECTANGULAR,
                 "certificate" if self._certificates else "tolerance": self._of_reference,
             }
             components += [
@@ -285,6 +297,60 @@ class _Work:
                 )
             )
         return budgets
+
+    def widened(self, found: SensorCalibration, budgets: Sequence[Budget]) -> SensorCalibration:
+        """Return a calibration whose matrix, angles and delays have what budgets of gains have.
+
+        But its scatter and the sensitivity of the reference. Changes of gains turn nothing.
+        """
+        diagnosis = self.snapshot.diagnostics.diagnosis
+        changes = diagnosis.stability.changes if diagnosis and diagnosis.stability else ()
+        turns = any(
+            each.is_turn or each.channel is not None
+            for each in changes
+            if each.sensor in (found.sensor, found.reference)
+        )
+        known = {"estimate", "variation", "certificate", "tolerance"}
+        turning = {"linearity", "misfit", *(("drift",) if turns else ())}
+        parts = [{e.source: e.relative for e in each.components} for each in budgets]
+        gain, direction = (
+            np.array([math.hypot(*(each[n] for n in each if n in which)) for each in parts])
+            for which in ({n for each in parts for n in each} - known, turning)
+        )
+        return found.widened(gain, direction)
+
+    def _unmodelled(self, band: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+        """Return by how much gains may be off where the model does not hold, two of (n_channels,).
+
+        By power that sensors share beside the motion, as a share of the motion: a cross-spectrum
+        is off by it at most. And by noise that follows the motion: a part of the gain may be in it.
+        """
+        snapshot, estimate = self.snapshot, self._estimate
+        of_motion, of_others = np.zeros((2, len(snapshot.channels)))
+        if estimate.noise is None:
+            return of_others, of_motion
+        edges = band_edges(snapshot.frequency, band)
+        levels = estimate.spectrum(estimate.method).levels(edges)
+        high = levels.ends(factor=False)[1][0]
+        level = np.clip(np.nan_to_num(levels.mean[0]), 0.0, high)
+        most = np.fmax(level, high - level)
+        for each in levels.contributions:
+            with np.errstate(invalid="ignore"):
+                amount = np.fmax(each.below, each.above)[0] + np.nan_to_num(each.share[0] * level)
+            amount = np.fmin(np.where(np.isinf(each.share[0]), np.inf, amount), most)
+            if each.source in _SHARED:
+                of_others = np.fmax(of_others, amount)
+            elif each.source in _FOLLOWING:
+                of_motion = np.fmax(of_motion, amount)
+        motion = np.fmax(snapshot.data_psd[slice(*edges)].mean(axis=0) - level, level / 1e6)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shares = (np.nan_to_num(each / motion) for each in (of_others, of_motion))
+        shared, following = (np.fmin(each, 1.0) for each in shares)
+        return shared, np.sqrt(following)
+
+    def _with(self, column: int, sizes: FloatArray) -> float:
+        """Return the size of a channel with the largest of the reference."""
+        return math.hypot(sizes[column], sizes[list(self._columns(self._reference))].max())
 
     def _drift(self, column: int) -> float:
         """Return the standard deviation of a gain over the recording, where responses change."""

@@ -7,14 +7,15 @@ all other sensors k as instruments: the noise of none of the sensors biases it. 
 covariance ``Sigma (x) P^-1 / n``, with Sigma the cross-spectra of ``x_j - G x_r`` and
 ``P = S_rk S_kk^-1 S_kr`` the motion in the reference predicted by the others. Over a band G is
 modelled as a constant real matrix M with one delay per channel. Gains, angles and cross-axis
-sensitivities follow from M, and their errors from its covariance. Scatter over the frequencies of
-the band beyond these errors is reported separately: the response varies, or not all motion is
-common.
+sensitivities follow from M, and their errors from its covariance. Where G scatters over the
+frequencies of the band by clearly more than these errors, the response varies, or not all motion is
+common: M holds at each frequency within this scatter, which is part of its covariance.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,8 @@ _PER_INSTRUMENT = 2  # averages for each channel of the other sensors
 _NEIGHBOURS = 16  # frequencies on either side whose noise weights one
 _CORRELATED = 3  # the nearest of them, whose errors are its own
 _STANDS_OUT = 4.0  # noise over that of the neighbours that is not chance
+VARIES = 1.5
+"""Scatter over frequencies, over what errors explain, from which the response varies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,8 +67,11 @@ class SensorCalibration:
     is_ambiguous : bool
         Whether the cycle of the delay, and with it the sign of `matrix`, is uncertain: in a narrow
         band of motion.
+    scatter : float64, shape (d,)
+        Standard errors of `gain` by the scatter of the averages alone.
     excess : float
-        Scatter over frequencies relative to the errors: 1 if the model holds.
+        Scatter over frequencies relative to the errors of averages: 1 if the model holds. Above
+        1.5, all other errors are those at any frequency of the band.
     dof : float
         Degrees of freedom of the errors.
     n_frequencies : int
@@ -84,9 +90,40 @@ class SensorCalibration:
     delay: Value
     skew: Value
     is_ambiguous: bool
+    scatter: FloatArray = field(metadata=NOT_IN_JSON)
     excess: float
     dof: float
     n_frequencies: int = field(metadata=NOT_IN_JSON)
+
+    def widened(self, gain: FloatArray, direction: FloatArray) -> SensorCalibration:
+        """Return it with further relative standard errors of each row of the matrix.
+
+        Parameters
+        ----------
+        gain, direction : float64, shape (d,)
+            Of the length of the row, and across it.
+        """
+        M, length = self.matrix.value, self.gain.value
+        across = (direction * length)[:, None]
+        own = 1.0 - np.eye(len(M))  # the diagonal of `cross_axis` is known
+        ratio = self.cross_axis.value
+        turned, pairs = np.rad2deg(direction), np.triu_indices(len(M), 1)
+        late = direction / (np.pi * (self.low + self.high))
+        added = {
+            "matrix": np.hypot(gain[:, None] * M, across),
+            "gain": gain * length,
+            "cross_axis": own * across / np.abs(np.diag(M))[:, None] * np.hypot(1.0, ratio),
+            "rotation_deg": np.full(self.rotation_deg.value.shape, turned.max()),
+            "angle_deg": turned,
+            "orthogonality_deg": np.hypot(turned[pairs[0]], turned[pairs[1]]),
+            "delay": late,
+            "skew": np.where(np.arange(len(M)) > 0, np.hypot(late, late[0]), 0.0),
+        }
+        wider: dict[str, Any] = {}
+        for name, further in added.items():
+            each: Value = getattr(self, name)
+            wider[name] = Value(each.value, np.hypot(each.error, further))
+        return replace(self, **wider)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,7 +223,17 @@ class CommonMotion:
         middle = np.einsum("fcg,fab->cagb", pair.noise, pair.weight)
         covariance = np.einsum("ia,cagb,bj->cigj", inverse, middle, inverse).real
         covariance = covariance.reshape(d * d, d * d) * inflation / 2
+        scatter = with_errors(matrix, covariance)["gain"].error
         delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
+        if excess > VARIES:
+            share = np.einsum("faa->f", pair.weight).real
+            rows = residual.real.reshape(len(f), d * d)
+            covariance = covariance + (rows * share[:, None]).T @ rows / share.sum()
+            phase = np.einsum("fca,fab,cb->fc", residual, pair.weight, matrix).imag
+            phase /= np.sqrt(energy) * np.sqrt(omega**2 @ energy)
+            delay_cov = delay_cov + phase.T @ phase
+        else:
+            covariance, delay_cov = (max(1.0, excess**2) * e for e in (covariance, delay_cov))
         unknown = np.nan if pair.is_ambiguous else 0.0
         to_first = np.eye(d)
         to_first[:, 0] -= 1.0
@@ -200,6 +247,7 @@ class CommonMotion:
             delay=Value(unknown + delay, unknown + np.sqrt(np.diag(delay_cov))),
             skew=Value(to_first @ delay, np.sqrt(np.diag(to_first @ delay_cov @ to_first.T))),
             is_ambiguous=pair.is_ambiguous,
+            scatter=scatter,
             excess=excess,
             dof=2 * max(self.n_effective - d, 1.0) * len(f) / inflation,
             n_frequencies=len(f),

@@ -9,6 +9,7 @@ from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, student_quantile
+from estimator.responses.calibration import VARIES
 from estimator.wording import signed, span
 from tui.page.table import Table
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from estimator.responses.derived_quantities import Value
 
 _LEAST_SHOWN = 1e-5
-_VARIES = 1.5
-"""Scatter over frequencies, over what errors explain, from which on a remark says so."""
 _ALIGNED = 3.0
 """Standard errors from 0 and 180° from which on an angle is shown with its error."""
 _ROUNDING = 1e-6
@@ -211,8 +210,8 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
     name = snapshot.sensor_names[found.reference]
     level = (
         f"Expanded uncertainties at a level of {100 * found.confidence:g} %, coverage factor k by "
-        "the effective degrees of freedom. Angles, delays and cross-axis values: scatter of the "
-        f"estimate only, k = {_k(found):.2f}; an angle within {_ALIGNED:g} standard errors of 0 or "
+        "the effective degrees of freedom. Angles, delays and cross-axis values have k = "
+        f"{_k(found):.2f}; an angle within {_ALIGNED:g} standard errors of 0 or "
         "180° has a limit."
     )
     lines = [level]
@@ -257,10 +256,10 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
     ]
     lines += [
         f"{snapshot.sensor_names[each.sensor]}: its response varies over the band by "
-        f"{each.excess:.2g} times the errors, or not all motion is common. The budget includes it."
-        " The sensitivity is a mean over the band weighted by SNR: see the curve in the JSON file."
+        f"{each.excess:.2g} times the errors, or not all motion is common. Values are means over "
+        "the band weighted by SNR, and uncertainties those at each frequency."
         for each in found.sensors
-        if each.excess > _VARIES
+        if each.excess > VARIES
     ]
     return lines + [
         f"{snapshot.sensor_names[sensor]} is not calibrated: {why}"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 from scipy.special import stdtrit
 from typer.testing import CliRunner
 
@@ -217,6 +219,60 @@ def test_a_higher_level_of_confidence_widens_what_is_stated(snapshot: Snapshot) 
         for level in (0.95, 0.99)
     )
     assert cautious.k / usual.k == pytest.approx(2.576 / 1.960, rel=0.01)
+
+
+def _rings(felt: np.ndarray, _: np.random.Generator) -> None:
+    """Give a channel a resonance, within the band."""
+    felt[1, :, 0] += signal.lfilter(*signal.iirpeak(12, 15, fs=50.0), felt[1, :, 0])
+
+
+def _compresses(felt: np.ndarray, _: np.random.Generator) -> None:
+    """Compress the reference."""
+    size = 3 * felt[0].std()
+    felt[0] = np.tanh(felt[0] / size) * size
+
+
+def _has_play(felt: np.ndarray, _: np.random.Generator) -> None:
+    width, at, found = 0.02 * felt[1, :, 0].std(), 0.0, []
+    for value in felt[1, :, 0].tolist():
+        at = min(max(at, value - width), value + width)
+        found.append(at)
+    felt[1, :, 0] = found
+
+
+def _feels_more(felt: np.ndarray, rng: np.random.Generator) -> None:
+    """Add a second motion, that every sensor feels to another degree."""
+    more = 5 * rng.standard_normal(felt.shape[1:])
+    felt += rng.standard_normal((len(felt), 1, 1)) * more
+
+
+@pytest.mark.parametrize("breaks", [_rings, _compresses, _has_play, _feels_more])
+def test_what_breaks_the_model_is_in_the_uncertainties(
+    breaks: Callable[[np.ndarray, np.random.Generator], None],
+) -> None:
+    rng = np.random.default_rng(16)
+    felt = np.stack([100 * rng.standard_normal((15_000, 3))] * 3)
+    breaks(felt, rng)
+    samples = dict(zip(GAINS, felt + rng.standard_normal(felt.shape), strict=True))
+    snapshot = estimate([recording_of_arrays(samples, 50.0)], SETTINGS)
+    found = calibrate(Result(snapshot, SETTINGS), None)
+    for each in found.whole_band("sensitivity"):
+        assert abs(each.value - 1) < 1.3 * each.expanded
+    for sensor in found.sensors:
+        for value, truth in (
+            (sensor.matrix, np.eye(3)),
+            (sensor.cross_axis, np.eye(3)),
+            (sensor.rotation_deg, 0.0),
+            (sensor.orthogonality_deg, 0.0),
+            (sensor.skew, 0.0),
+        ):
+            assert np.all(np.abs(value.value - truth) <= 3.5 * value.error)
+
+
+def test_steady_sensors_have_the_uncertainty_of_finite_averages(snapshot: Snapshot) -> None:
+    for each in calibrate(Result(snapshot, SETTINGS), None).whole_band("sensitivity"):
+        sizes = {part.source: part.relative for part in each.components}
+        assert each.combined < 1.2 * math.hypot(sizes["estimate"], sizes["quantisation"])
 
 
 @pytest.mark.parametrize(
