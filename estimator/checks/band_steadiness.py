@@ -23,6 +23,7 @@ from estimator.checks.steadiness import (
     ResponseChange,
     ResponseScores,
     regression,
+    slopes_of,
 )
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum, maximise
@@ -75,8 +76,9 @@ class _Explained:
 
     Attributes
     ----------
-    power, scatter : float64, shape (n_channels,)
-        What regressions explain beside the motion, and what they explain by scatter.
+    power, scatter, leaked : float64, shape (n_channels,)
+        What regressions explain beside the motion, what they explain by scatter, and what leaks at
+        the edges of bursts where responses differ: it is coherent with these.
     beside : float64, shape (n_channels,)
         Share of the noise of a channel beside the motion.
     added : float64, shape (n_channels,)
@@ -89,6 +91,7 @@ class _Explained:
 
     power: FloatArray
     scatter: FloatArray
+    leaked: FloatArray
     beside: FloatArray
     added: FloatArray
     degrees: float
@@ -101,9 +104,10 @@ class _Explained:
         A channel counts whose noise is seen beside the motion, and grows by `ADDED` at least.
         """
         degrees = self.degrees * self.left / (1 + self.left)
-        much = self.power - self.scatter > ADDED * self.scatter * (1 + self.left)
+        power = self.power - self.leaked
+        much = power - self.scatter > ADDED * self.scatter * (1 + self.left)
         much &= self.beside > LEAST_SHARE
-        return degrees * float((self.power[much] / self.scatter[much]).max(initial=1.0)), degrees
+        return degrees * float((power[much] / self.scatter[much]).max(initial=1.0)), degrees
 
     def where_clear(self, alarm: float) -> FloatArray:
         """Return what is added to the noise, shape (n_channels,); zero where that is by chance."""
@@ -456,10 +460,13 @@ def band_steadiness(
             "beside": beside,
             "noise": noise * used[:, :, None],
             "power": np.zeros_like(noise),
+            "leaked": np.zeros_like(beside),
             "projectors": some.sums(np.abs(found.projector) ** 2),
         }
+        slopes = np.zeros_like(found.directions) if is_weak else slopes_of(maximum, bins, psd)
         if used.any():
             sums["power"] = some.of_parts(found.explained(np.repeat(used.T, some.sizes, axis=1)))
+            sums["leaked"] = some.sums(found.leaked(slopes))
         sums |= some.scores(found, own, sensor_of)
         if by_run:
             of_run = regression(parts.joined(some.places, by_run), at, psd[bins])
@@ -467,7 +474,8 @@ def band_steadiness(
         of_pieces.append((some.of_band, sums))
         if not is_weak:
             more = (spread / some.sizes).tolist()
-            each = ResponseScores.of(found, dims, list(zip(some.slices, more, strict=True)))
+            pieces_of = list(zip(some.slices, more, strict=True))
+            each = ResponseScores.of(found, dims, pieces_of, slopes)
             for number, one in zip(some.of_band.tolist(), each, strict=True):
                 responses[number].append(one)
     if not of_pieces:
@@ -524,6 +532,7 @@ def _of_band(
         _Explained(
             power=power,
             scatter=scatter,
+            leaked=sums["leaked"] / n_freqs,
             beside=sums["beside"] / n_freqs,
             added=n_freqs * fisher.covariance(sums["projectors"][None])[0] @ (power - scatter),
             degrees=2 * n_freqs**2 / float(sums["spread"]) * float(n_alike.min()) * q,

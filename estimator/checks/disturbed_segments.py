@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from estimator.checks.loudness import LASTS, Loudness, without_bursts
 from estimator.checks.segment_gains import SegmentGains, UnsteadyGain
+from estimator.checks.steadiness import slopes_of
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
@@ -93,9 +94,11 @@ def segment_findings(
     maximum: Maximum,
     good: BoolArray,
     dims: tuple[int, ...],
+    *,
     begin: FloatArray,
+    psd: FloatArray,
 ) -> SegmentFindings:
-    """Return what segments show at `good` frequencies, shape (n_freqs,).
+    """Return what segments show at `good` frequencies, shape (n_freqs,), of this `psd`.
 
     `begin` are the times at which parts begin, within which gains may change, shape (n_parts,).
     Where noise changes all the time, at some frequencies, or gains do, segments are not disturbed.
@@ -121,7 +124,11 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    gains, powers, felt = SegmentGains(own, course.bins[there], groups, dims), [], []
+    leaks = slopes_of(maximum, course.bins[there], psd) * at.eigenvalues[:, None]
+    leaks = leaks @ at.eigenvectors.conj().swapaxes(1, 2)
+    motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)
+    gains = SegmentGains(own, course.bins[there], groups, dims, leaks=leaks, power=motion)
+    powers, felt = [], []
     for residual, motion in residuals:
         powers.append(np.einsum("sfp->sp", np.abs(residual) ** 2))  # faster than a sum
         felt.append(np.einsum("sfp->s", np.abs(motion) ** 2))

@@ -4,6 +4,7 @@ A sensor whose gain is by g off in a segment leaves g times the motion in its re
 frequencies; noise leaves at two frequencies what is independent. So products of what the motion
 explains of residuals, at different frequencies, have the mean g², whatever the noise does. What the
 mean of a part of time explains is taken off first: parts show it (`estimator.checks.steadiness`).
+A burst at the edge of a segment, where responses differ, leaves what a gain does.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.checks.loudness import across
-from estimator.checks.steadiness import patterns
+from estimator.checks.steadiness import STEEPEST, patterns
 from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
@@ -76,10 +77,21 @@ class SegmentGains:
     groups : list of int64
         Indices of each group among them.
     dims : tuple of int
+    leaks : complex128, shape (n_bins, n_channels, n_channels)
+        Products of what leaks by slopes of responses, per bin, and motion.
+    power : float64, shape (n_bins, n_channels)
+        Of motion.
     """
 
     def __init__(
-        self, own: FloatArray, bins: IntArray, groups: list[IntArray], dims: tuple[int, ...]
+        self,
+        own: FloatArray,
+        bins: IntArray,
+        groups: list[IntArray],
+        dims: tuple[int, ...],
+        *,
+        leaks: ComplexArray,
+        power: FloatArray,
     ) -> None:
         self._own, self._some = [own[group] for group in groups], list(_apart(bins, groups))
         self._patterns = list(_of_sensors(dims))
@@ -87,6 +99,11 @@ class SegmentGains:
         self._sensors = [(slice(end - d, end), _signs(d)) for end, d in ends]
         self._score: list[FloatArray] = []
         self._weight: list[FloatArray] = []
+        leaked = []
+        for c, signs in self._sensors:
+            known = (own[:, c].T @ power[:, c]).reshape(-1) @ np.abs(signs)
+            leaked.append(np.abs(leaks[:, c, c].sum(axis=0).reshape(-1) @ signs / known) ** 2)
+        self._leaked = STEEPEST * np.concatenate(leaked)
 
     def add(self, residual: ComplexArray, motion: ComplexArray) -> None:
         """Add the next group, of shape (n_segments, n_freqs, n_channels)."""
@@ -126,7 +143,7 @@ class SegmentGains:
         is_seen = (sure > UNSTABLE) & (variance > SLOW * between)
         is_seen &= by_part[:-FEW].sum(axis=0) > SLOW * variance
         power = variance * [len(each.pairs) for each in self._patterns]
-        is_seen &= power > LARGEST * power.max()
+        is_seen &= (power > LARGEST * power.max()) & (variance > self._leaked)
         best: dict[int, UnsteadyGain] = {}
         for number in np.flatnonzero(is_seen)[np.argsort(power[is_seen])].tolist():
             own = self._patterns[number]

@@ -411,7 +411,7 @@ def stability(
             dims=dims,
             time=(begin, end),
         )
-    single = _of_segments(course, maximum, good, dims, begin)
+    single = _of_segments(course, maximum, good, dims, begin=begin, psd=psd)
     if course is not None and course.findings is None:
         span, time = (float(low[0]), float(high[-1])), (float(begin[0]), float(end[-1]))
         single = replace(single, band=span, time=time)
@@ -473,12 +473,12 @@ def _of_segments(
     maximum: Maximum,
     good: BoolArray,
     dims: tuple[int, ...],
-    begin: FloatArray,
+    **of_bench: FloatArray,
 ) -> SegmentFindings:
     """Return what single segments show, if there are enough."""
     if course is None or len(course.spectra) < MIN_SEGMENTS * MIN_PARTS:
         return SegmentFindings.none(0, dims)
-    return segment_findings(course, maximum, good, dims, begin)
+    return segment_findings(course, maximum, good, dims, **of_bench)
 
 
 def _are_close(frequency: FloatArray, step: float) -> bool:
@@ -642,10 +642,13 @@ def _changed(
         strength = {
             number: (chi - df) / math.sqrt(2 * max(df, 1)) for number, (chi, df) in tests.items()
         }
-        sensor = max(strength, key=lambda each: strength[each])
-        chi, df = tests[sensor]
-        most = critical_value(df, FALSE_ALARM / len(dims)) if df > 0 else math.inf
-        if not chi > (DOUBT if doubtful else 1.0) * most + second_order:
+        for sensor in sorted(left, key=strength.__getitem__, reverse=True):
+            chi, df = tests[sensor]
+            most = critical_value(df, FALSE_ALARM / len(dims)) if df > 0 else math.inf
+            most = (DOUBT if doubtful else 1.0) * most + second_order
+            if chi > most and chi > most + total.leaked(sensor, taken):
+                break
+        else:
             break
         own = total.without(taken)
         change = response_change(own, sensor, begin, end, int(first[sensor]))

@@ -47,6 +47,8 @@ ALIKE = 1e-6
 """Difference of chi-squared by rounding."""
 COST = 4.0
 """Of each parameter of a change, in terms of chi-squared: simple changes are named."""
+STEEPEST = 2 / 3
+"""Power that leaks by a slope of one per bin where a Hann window is steepest, over the motion."""
 FALSE_ALARM = 2e-3
 """Probability that steady responses of any sensor are found to change."""
 
@@ -114,6 +116,15 @@ class Regression:
         beyond = self.along - mean @ self.motion
         return _diagonal(beyond, self.coefficients - mean) * some[..., None]
 
+    def leaked(self, slopes: ComplexArray) -> FloatArray:
+        """Return the power that leaks where responses have slopes per bin, (n_bins, n_channels).
+
+        Of the averages: a third of their square, under a Hann window, and twice as much of bursts
+        at its steepest place. There it is coherent with the motion.
+        """
+        motion = self.motion.sum(axis=0) / (self.averages + slopes.shape[2]).sum()
+        return _diagonal(slopes @ motion, slopes) * STEEPEST
+
     def beside_fit(self) -> ComplexArray:
         """Return `along` without what is wrong with the fit, alike in all parts.
 
@@ -144,6 +155,29 @@ def _diagonal(a: ComplexArray, b: ComplexArray) -> FloatArray:
     )
 
 
+def whitening(at: Maximum, psd: FloatArray) -> FloatArray:
+    """Return the scales from units to whitened channels, shape (n_bins, n_channels)."""
+    share = (np.abs(at.eigenvectors) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
+    return np.asarray(np.sqrt((np.einsum("fpp->fp", at.rest).real + share) / psd))
+
+
+def slopes_of(maximum: Maximum, bins: IntArray, psd: FloatArray) -> ComplexArray:
+    """Return slopes of responses per bin, as coefficients of a `Regression`; 0 where not known.
+
+    `maximum` and `psd` are those of all frequencies.
+    """
+    here, ends = maximum.take(bins), []
+    U, P, scale = here.eigenvectors, here.projector, whitening(here, psd[bins])
+    known = maximum.converged & ~maximum.singular & (psd > 0).all(axis=1)
+    for step in (-1, 1):
+        near = np.clip(bins + step, 0, len(psd) - 1)
+        near = np.where(known[near], near, bins)
+        at = maximum.take(near)
+        V = (scale / whitening(at, psd[near]))[:, :, None] * at.eigenvectors
+        ends.append(P @ V @ np.linalg.inv(U.conj().swapaxes(1, 2) @ V))
+    return np.asarray((ends[1] - ends[0]) / 2)
+
+
 def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     """Regress the residuals of every part on its motion.
 
@@ -151,10 +185,7 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     parts, whose motion differs by scatter.
     """
     n, q = parts.averages, at.n_factors
-    U = at.eigenvectors
-    share = (np.abs(U) ** 2 @ at.eigenvalues[:, :, None])[:, :, 0]
-    fitted = np.einsum("fpp->fp", at.rest).real + share
-    scale = np.sqrt(fitted / psd)
+    U, scale = at.eigenvectors, whitening(at, psd)
     S = parts.csm * (scale[:, :, None] * scale[:, None, :])
     across = U.conj().swapaxes(1, 2) @ (S @ U)
     across = (across + across.conj().swapaxes(2, 3)) / 2
@@ -228,6 +259,8 @@ class _Piece:
         P, by the scales of both channels.
     along : complex128, shape (n_bins, n_channels, n_factors)
         U over the scales.
+    slopes : complex128, of the same shape
+        Of responses per bin, by the scales.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
     noise : float64, shape (n_parts, n_channels)
         Noise of ``P S_k P`` less that of the fit, times the averages: mean over frequencies.
@@ -237,6 +270,7 @@ class _Piece:
 
     beside: ComplexArray
     along: ComplexArray
+    slopes: ComplexArray
     motion: ComplexArray
     noise: FloatArray
     weight: FloatArray
@@ -265,6 +299,12 @@ class _Piece:
         across = self.along.swapaxes(0, 1).reshape(len(change), -1).conj().T
         found = (X.reshape(-1, len(across)) @ across).real.reshape(len(X), *change.shape)
         return np.asarray(self.weight[:, None, None] * found)
+
+    def leaks(self) -> ComplexArray:
+        """Return scores of leakage as by slopes, (n_parts, n_channels, n_channels)."""
+        along = self.along.swapaxes(0, 1).reshape(self.along.shape[1], -1).conj().T
+        X = (self.slopes @ self.motion).swapaxes(1, 2).reshape(len(self.motion), -1, len(along))
+        return np.asarray(self.weight[:, None, None] * (X @ along))
 
     def by_noise(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return scores of ``to, from`` by the noise of channels, shape (n_pairs, n_channels)."""
@@ -304,14 +344,19 @@ class ResponseScores:
 
     @classmethod
     def of(
-        cls, found: Regression, dims: tuple[int, ...], pieces: Sequence[tuple[slice, float]]
+        cls,
+        found: Regression,
+        dims: tuple[int, ...],
+        pieces: Sequence[tuple[slice, float]],
+        slopes: ComplexArray,
     ) -> list[ResponseScores]:
         """Return those of pieces: their frequencies, and the variance of their sums.
 
-        With neighbours correlated, over that of independent ones.
+        With neighbours correlated, over that of independent ones. `slopes` are as of `leaked`.
         """
         P, s, n = found.projector, found.scale, found.averages + found.directions.shape[2]
         beside, along = P * (s[:, :, None] * s[:, None, :]), found.directions / s[:, :, None]
+        slopes = s[:, :, None] * slopes
         scores = (s[:, :, None] * found.beside_fit()).swapaxes(1, 2)
         excess = found.beside - np.einsum("fpp->fp", P).real
         noise = (found.inverse @ excess[..., None])[..., 0]
@@ -320,7 +365,8 @@ class ResponseScores:
         for some, more in pieces:
             own_noise = n[:, None] * noise[:, some].sum(axis=1) / (some.stop - some.start)
             weight = np.full(len(n), 2 / more)
-            piece = _Piece(beside[some], along[some], found.motion[:, some], own_noise, weight)
+            motion = found.motion[:, some]
+            piece = _Piece(beside[some], along[some], slopes[some], motion, own_noise, weight)
             across = piece.along.swapaxes(0, 1).reshape(len(s.T), -1).conj().T
             score = (scores[:, :, some].reshape(-1, len(across)) @ across).real
             own = [piece.information(each, [each]) for each in sensors]
@@ -407,6 +453,13 @@ class ResponseScores:
     def test(self, sensor: int, known: Sequence[int] = ()) -> tuple[float, float]:
         """Return chi-squared and degrees of a sensor, beside those known to change."""
         return _chi_squared(*self.without(known).sensor(sensor))
+
+    def leaked(self, sensor: int, known: Sequence[int] = ()) -> float:
+        """Return what leakage at the edges of bursts may add to `test`, if all is coherent."""
+        to, of = (each[self._place(sensor)] for each in _within(self.dims))
+        leaks = np.sum([each.leaks()[:, to, of] for each in self._pieces], axis=0)
+        _, own = self.without(known).sensor(sensor)
+        return sum(_chi_squared(each, own)[0] for each in (leaks.real, leaks.imag)) * STEEPEST
 
 
 def _sensors(dims: Sequence[int]) -> list[slice]:

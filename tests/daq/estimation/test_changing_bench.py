@@ -35,12 +35,17 @@ def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, 
         motion[n // 2 :] = 0
     if kind == "red":
         motion = 1e-2 * np.cumsum(np.cumsum(motion - motion.mean(axis=0), axis=0), axis=0)
+    if "bursts" in kind:  # of 6 s
+        motion *= (np.arange(n) / RATE % 30 < 6)[:, None]
     later = time >= 0.4
     samples = {}
     for name in "ABC":
         turn = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
         felt = motion @ turn.T
-        if name == "B" and kind == "step":
+        if name == "B" and "late" in kind:
+            turns = np.exp(-2j * np.pi * 0.01 * np.fft.rfftfreq(n, 1 / RATE))
+            felt = np.fft.irfft(np.fft.rfft(felt, axis=0) * turns[:, None], n, axis=0)
+        if name == "B" and "step" in kind:
             felt[later, 0] *= 0.95
         elif name == "B" and kind == "ramp":
             felt *= (1 + 0.03 * (time - 0.5))[:, None]
@@ -291,6 +296,15 @@ def test_a_steady_bench_raises_no_alarm(kind: str, ratio: float) -> None:
         kinds = ResponseChanges | NoiseChanges
         assert not [each for each in snapshot.diagnostics.advice if isinstance(each, kinds)]
         assert all(clock.is_understood for clock in snapshot.clocks)
+
+
+def test_leakage_at_the_edges_of_bursts_is_no_response_that_changes() -> None:
+    """A delay of 10 ms by windows of 5 s adds 5 times the noise: as a gain, in each segment."""
+    for seed in range(2):
+        assert not changes(estimated("late bursts", seed, ratio=1e5))
+        (change,) = changes(estimated("late bursts step", seed, ratio=1e5))
+        assert change.sensors == (1,)
+        assert change.size == pytest.approx(-0.05, rel=0.1)
 
 
 def test_bursts_of_motion_among_weaker_motion_than_noise_are_no_change() -> None:

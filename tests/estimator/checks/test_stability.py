@@ -10,7 +10,7 @@ import pytest
 
 from estimator.checks.advice_on_noise import DisturbedSegments, NoiseChanges
 from estimator.checks.diagnose import Diagnostics, diagnose
-from estimator.checks.disturbed_segments import SegmentCourse, segment_findings
+from estimator.checks.disturbed_segments import SegmentCourse, SegmentFindings, segment_findings
 from estimator.checks.shared_motion import (
     CanonicalCoherence,
     may_have_moved,
@@ -33,7 +33,7 @@ from estimator.spectra.welch import (
     kept_rows,
 )
 from estimator.spectra.windows import get_window
-from estimator.types import ComplexArray
+from estimator.types import BoolArray, ComplexArray
 from tests.estimator.csm_models import rotation, white
 
 LENGTH, HOP = 256, 128
@@ -129,6 +129,12 @@ def test_disturbed_segments_are_named() -> None:
     assert 2 < advice.excess < 9
 
 
+def findings(course: SegmentCourse, csm: ComplexArray, good: BoolArray) -> SegmentFindings:
+    """Return what segments of three channels in the same motion show."""
+    psd = np.einsum("fpp->fp", csm).real
+    return segment_findings(course, maximise(csm, 1), good, (1, 1, 1), begin=np.zeros(1), psd=psd)
+
+
 def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> None:
     rng = np.random.default_rng(1)
     noise, motion = rng.standard_normal((2, 200, 48, 3, 2)) @ [1, 1j]
@@ -138,7 +144,7 @@ def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> Non
     course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
     for n_doubtful, found in ((0, [7]), (4, [7]), (20, [7]), (44, [])):
         good = np.arange(48) >= n_doubtful
-        shown = segment_findings(course, maximise(csm, 1), good, (1, 1, 1), np.zeros(1))
+        shown = findings(course, csm, good)
         assert np.flatnonzero(shown.disturbed).tolist() == found
         assert not shown.gains
 
@@ -157,7 +163,7 @@ def test_loudness_that_changes_from_segment_to_segment_is_no_independent_scatter
         csm = np.einsum("sfp,sfq->fpq", spectra, spectra.conj()) / len(spectra)
         course = SegmentCourse(spectra, np.arange(48), np.arange(200.0), np.zeros(200, np.int64))
         good = np.ones(48, np.bool_)
-        found = segment_findings(course, maximise(csm, 1), good, (1, 1, 1), np.zeros(1)).loudness
+        found = findings(course, csm, good).loudness
         seen.append(200 * found.deviation**2)
     restless, steady = np.array(seen[::2]), np.array(seen[1::2])
     # the variance of 200 draws of a gamma variable of kurtosis 5.4: 16 %, of 20 means 4 %
