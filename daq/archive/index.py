@@ -6,26 +6,21 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from daq.archive.documents import Documents
 from daq.archive.rollup import month_of
-from daq.archive.spectra_file import Described, Origin, SpectraFile
+from daq.archive.spectra_file import Described, SpectraFile
 from daq.bench.channel import Channel
-from daq.bench.sensitivity import as_document, sensitivities_from
-from daq.caveats import Caveat, Caveats
-from daq.estimation.snapshot import Overlap
 from daq.recording.file_format import channel_attributes, channels_of, plain
-from estimator.checks.count_limits import CountLimits
-from estimator.spectra.segment_rejection import Reason
 
 FILE = "index.sqlite"
 ROLLUP = "rollup-"
 """Names of files of years begin with this (`daq.archive.answers`)."""
-PLAIN = ("usable", "elapsed", "residual", "rounded")
-"""Fields of `Described` that a document has as they are."""
+_OWN = ("start_utc_ns", "n_segments", "months", "daily", "single")
+"""Attributes of an entry beside what describes its file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,21 +88,8 @@ class Index:
             found: dict[str, Any] | None = self._documents.get(self._name(path), state)
             if found is None:
                 return None
-            described = Described(
-                origin=Origin(**found.pop("origin")),
-                channels=self._channels_of(found.pop("channels")),
-                left_out={Reason(k): v for k, v in found.pop("left_out").items()},
-                counts=CountLimits.from_tables(found.pop("counts")),
-                stood_still={int(k): v for k, v in found.pop("stood_still").items()},
-                lacking={int(k): v for k, v in found.pop("lacking").items()},
-                shortened={k: (v[0], v[1]) for k, v in found.pop("shortened").items()},
-                not_understood=tuple(found.pop("not_understood")),
-                caveats=Caveats(map(Caveat, found.pop("caveats"))),
-                sensitivities=sensitivities_from(found.pop("sensitivities")),
-                overlaps=tuple(Overlap(*each) for each in found.pop("overlaps")),
-                **{name: found.pop(name) for name in PLAIN},
-            )
-            return IndexEntry(path, described, **found)
+            described = Described.of(found, self._channels_of(found["channels"]))
+            return IndexEntry(path, described, **{name: found[name] for name in _OWN})
         except (OSError, AttributeError, KeyError, ValueError, TypeError):
             return None
 
@@ -120,17 +102,8 @@ class Index:
         ]
         key = hashlib.sha256(json.dumps(channels).encode()).hexdigest()
         self._documents.put(key, channels)
-        document = {each.name: getattr(described, each.name) for each in fields(described)} | {
-            "origin": asdict(described.origin),
-            "counts": asdict(described.counts),
-            "sensitivities": as_document(described.sensitivities),
-            "channels": key,
-            "start_utc_ns": entry.start_utc_ns,
-            "n_segments": entry.n_segments,
-            "months": dict(entry.months),
-            "daily": entry.daily,
-            "single": entry.single,
-        }
+        own = {name: getattr(entry, name) for name in _OWN}
+        document = described.document | own | {"channels": key}
         state = about.st_size, about.st_mtime_ns
         self._documents.put(self._name(entry.path), document, state)
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +27,7 @@ from daq.bench.sensitivity import Sensitivities, as_document, sensitivities_from
 from daq.caveats import NO_CAVEATS, Caveats
 from daq.errors import ArchiveError, RecordingError, WrongArchiveError
 from daq.estimation.snapshot import Overlap
-from daq.recording.file_format import channel_attributes, channels_of
+from daq.recording.file_format import channel_attributes, channels_of, plain
 from daq.recording.storage.opening import open_file
 from daq.recording.storage.packing import check_chunks
 from daq.recording.storage.refusals import dataset, member, number, text
@@ -85,6 +84,23 @@ class Origin:
     end_ns: int = 0
 
 
+_ORIGIN: dict[str, tuple[str, type]] = {
+    "run_id": ("run_id", str),
+    "path": ("source", str),
+    "n_bytes": ("source_bytes", int),
+    "modified_ns": ("source_modified_ns", int),
+    "n_samples": ("source_samples", int),
+    "closed": ("source_closed", bool),
+    "files": ("source_files", str),
+    "responses": ("source_responses", str),
+    "begin_ns": ("source_begin_ns", int),
+    "end_ns": ("source_end_ns", int),
+}
+"""Key in a document and type of each field of an origin."""
+_TEXTS = {"format", *(key for key, kind in _ORIGIN.values() if kind is str)}
+"""Attributes that are text, and not JSON."""
+
+
 @dataclass(frozen=True, slots=True)
 class Described:
     """What spectra of a recording rest on.
@@ -134,6 +150,52 @@ class Described:
     rounded: bool = False
     caveats: Caveats = NO_CAVEATS
     overlaps: tuple[Overlap, ...] = ()
+
+    @classmethod
+    def of(
+        cls, document: Mapping[str, Any], channels: tuple[tuple[str, Channel], ...]
+    ) -> Described:
+        """Return what a document says; those of earlier versions lack some keys."""
+        origin = {
+            name: kind(document[key]) for name, (key, kind) in _ORIGIN.items() if key in document
+        }
+        of_counts = {each.name: document.get(each.name, {}) for each in fields(CountLimits)}
+        shortened = document.get("shortened", {}).items()
+        return cls(
+            origin=Origin(**origin),
+            channels=channels,
+            usable=float(document["usable"]),
+            elapsed=float(document["elapsed"]),
+            left_out={Reason(k): int(v) for k, v in document["left_out"].items()},
+            residual={k: float(v) for k, v in document["residual"].items()},
+            not_understood=tuple(document.get("not_understood", ())),
+            counts=CountLimits.from_tables(of_counts),
+            stood_still={int(k): float(v) for k, v in document["stood_still"].items()},
+            lacking={int(k): int(v) for k, v in document.get("lacking", {}).items()},
+            shortened={sensor: (float(late), float(early)) for sensor, (late, early) in shortened},
+            sensitivities=sensitivities_from(document.get("sensitivities", ())),
+            caveats=Caveats.of(document),
+            overlaps=tuple(Overlap(*each) for each in document.get("overlaps", ())),
+        )
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """All but the channels, as JSON has it."""
+        return {
+            **{key: getattr(self.origin, name) for name, (key, _) in _ORIGIN.items()},
+            "usable": self.usable,
+            "elapsed": self.elapsed,
+            "left_out": {str(k): v for k, v in self.left_out.items()},
+            "residual": dict(self.residual),
+            "not_understood": dict.fromkeys(self.not_understood, True),
+            **asdict(self.counts),
+            "stood_still": dict(self.stood_still),
+            **self.caveats.keys,
+            "lacking": dict(self.lacking),
+            "shortened": dict(self.shortened),
+            "sensitivities": as_document(self.sensitivities),
+            "overlaps": self.overlaps,
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +321,7 @@ class SpectraWriter:
 
         `found` are the summaries with their months.
         """
-        hdf5, file, origin = self._hdf5, self._hdf5.file, described.origin
+        hdf5, file = self._hdf5, self._hdf5.file
         for month, summary in found:
             _write_summary(hdf5, f"months/{month}", summary, total=not self._daily)
         self._csm.resize(len(self._stretches), axis=0)
@@ -270,35 +332,13 @@ class SpectraWriter:
         for name in dict.fromkeys(sensor for sensor, _ in described.channels):
             own = [channel for sensor, channel in described.channels if sensor == name]
             groups.create_group(name).attrs.update(channel_attributes(own))
+        document = described.document | {"daily": self._daily, "single": self._single}
         file.attrs.update(
             {
                 "format": FORMAT,
                 "format_version": FORMAT_VERSION,
-                "run_id": origin.run_id,
-                "source": origin.path,
-                "source_bytes": origin.n_bytes,
-                "source_modified_ns": origin.modified_ns,
-                "source_samples": origin.n_samples,
-                "source_closed": int(origin.closed),
-                "source_files": origin.files,
-                "source_responses": origin.responses,
-                "source_begin_ns": origin.begin_ns,
-                "source_end_ns": origin.end_ns,
                 "sensors": list(groups),
-                "usable": described.usable,
-                "elapsed": described.elapsed,
-                "left_out": json.dumps({str(k): v for k, v in described.left_out.items()}),
-                "residual": json.dumps(dict(described.residual)),
-                "not_understood": json.dumps(dict.fromkeys(described.not_understood, True)),
-                **{name: json.dumps(each) for name, each in asdict(described.counts).items()},
-                "stood_still": json.dumps(dict(described.stood_still)),
-                **{key: int(holds) for key, holds in described.caveats.keys.items()},
-                "lacking": json.dumps(dict(described.lacking)),
-                "shortened": json.dumps(dict(described.shortened)),
-                "sensitivities": json.dumps(as_document(described.sensitivities)),
-                "overlaps": json.dumps(described.overlaps),
-                "daily": int(self._daily),
-                "single": int(self._single),
+                **{name: _attribute(value) for name, value in document.items()},
             }
         )
         self._unfinished.close()
@@ -345,40 +385,8 @@ class SpectraFile:
             for name in attributes["sensors"]
             for channel in channels_of(member(groups, str(name)).attrs)
         )
-        self.described = Described(
-            origin=Origin(
-                run_id=text(attributes, "run_id"),
-                path=text(attributes, "source"),
-                n_bytes=int(number(attributes, "source_bytes")),
-                modified_ns=int(number(attributes, "source_modified_ns")),
-                n_samples=int(number(attributes, "source_samples")),
-                closed=bool(number(attributes, "source_closed")),
-                files=str(attributes.get("source_files", "")),  # since days of stations
-                responses=str(attributes.get("source_responses", "")),
-                begin_ns=int(attributes.get("source_begin_ns", 0)),
-                end_ns=int(attributes.get("source_end_ns", 0)),
-            ),
-            channels=channels,
-            usable=float(number(attributes, "usable")),
-            elapsed=float(number(attributes, "elapsed")),
-            left_out={Reason(k): int(v) for k, v in _table(attributes, "left_out").items()},
-            residual={k: float(v) for k, v in _table(attributes, "residual").items()},
-            not_understood=tuple(_table(attributes, "not_understood", optional=True)),
-            counts=CountLimits.from_tables(
-                {k.name: _table(attributes, k.name, optional=True) for k in fields(CountLimits)}
-            ),
-            stood_still={int(k): float(v) for k, v in _table(attributes, "stood_still").items()},
-            caveats=Caveats.of(attributes),
-            lacking={
-                int(k): int(v) for k, v in _table(attributes, "lacking", optional=True).items()
-            },
-            shortened={
-                sensor: (float(late), float(early))
-                for sensor, (late, early) in _table(attributes, "shortened", optional=True).items()
-            },
-            sensitivities=sensitivities_from(json.loads(attributes.get("sensitivities", "[]"))),
-            overlaps=tuple(Overlap(*o) for o in json.loads(attributes.get("overlaps", "[]"))),
-        )
+        document = {name: _value(name, plain(each)) for name, each in attributes.items()}
+        self.described = Described.of(document, channels)
         self.stretches: NDArray[np.void] = dataset(file, "stretches", STRETCH_DTYPE)[...]
         self.is_daily = bool(attributes.get("daily", 0))
         """Whether the matrices of stretches have become those of days."""
@@ -532,12 +540,15 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise ArchiveError(f"{path}: damaged: {reason}") from error
 
 
-def _table(
-    attributes: h5py.AttributeManager, name: str, *, optional: bool = False
-) -> dict[str, Any]:
-    if optional and name not in attributes:  # of files of before
-        return {}
-    found = json.loads(text(attributes, name))
-    if not isinstance(found, dict):
-        raise TypeError(f"attribute {name}; expected a table")
-    return found
+def _attribute(value: object) -> object:
+    """Return a value of a document as an attribute has it."""
+    if isinstance(value, bool):
+        return int(value)
+    return value if isinstance(value, (str, int, float)) else json.dumps(value)
+
+
+def _value(name: str, attribute: Any) -> Any:  # noqa: ANN401 - any value of JSON
+    """Return what was written as an attribute."""
+    if name in _TEXTS or not isinstance(attribute, str):
+        return attribute
+    return json.loads(attribute)
