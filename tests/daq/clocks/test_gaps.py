@@ -1,4 +1,4 @@
-"""Many gaps: the work is that of a recording without any, and what is left is used."""
+"""Recordings with many gaps, and delays that are measured from their samples."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from daq.clocks.aligned_recording import AlignedRecording
 from daq.clocks.resampling import resample
 from daq.clocks.sensor_reader import from_instants
 from daq.estimation.estimation import estimate
+from daq.estimation.segments import segment_pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import NoResultError
 from daq.protocols.block import HostTime
@@ -20,8 +21,8 @@ from daq.recording.reader import Recording
 from daq.recording.sensor_record import SensorRecord
 from daq.results.facts.recordings import NotInLiveEstimate, SensorLost, SpanShortened
 from daq.results.result import Result
-from tests.daq.clocks.recordings import ORIGIN, blocks, counts, create, write, write_polled
-from tests.daq.clocks.recordings import Sensor as FreeRunning
+from estimator.checks.advice_on_signals import Copies
+from tests.daq.clocks.recordings import ORIGIN, Sensor, blocks, counts, create, write, write_polled
 
 RATE, N_SAMPLES = 50, 18_000
 NAMES = ("a", "b", "c")
@@ -128,8 +129,8 @@ def test_loss_of_half_of_all_samples_is_reported_immediately(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("names", ["AB", "ABC"])
 def test_a_sensor_that_never_sent_is_named_and_left_out(tmp_path: Path, names: str) -> None:
-    sensors = {name: FreeRunning(counts(3000, 3, ord(name))) for name in names}
-    writer = create(tmp_path / "r.h5", sensors | {"D": FreeRunning(counts(1, 3, 1))})
+    sensors = {name: Sensor(counts(3000, 3, ord(name))) for name in names}
+    writer = create(tmp_path / "r.h5", sensors | {"D": Sensor(counts(1, 3, 1))})
     for name, sensor in sensors.items():
         for block in blocks(name, sensor, 2.0):
             writer.append(block)
@@ -162,7 +163,7 @@ def test_a_sensor_that_is_silent_in_one_of_two_files_is_named(
     run_id = ""
     for number, without in enumerate(silent):
         path = tmp_path / ("r.h5", "r-2.h5")[number]
-        sensors = {name: FreeRunning(counts(3000, 3, ord(name) + number)) for name in "ABCD"}
+        sensors = {name: Sensor(counts(3000, 3, ord(name) + number)) for name in "ABCD"}
         later = number * 30 * 10**9
         at = HostTime(ORIGIN.monotonic_ns + later, ORIGIN.utc_ns + later)
         writer = create(path, sensors, created=at, continues=run_id)
@@ -193,7 +194,7 @@ def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
     for n_gaps in (0, 200):
         gaps = tuple((3000 + 20 * number, 3001 + 20 * number) for number in range(n_gaps))
         sensors = {
-            name: FreeRunning(motion + counts(N_SAMPLES, 1, 7 + number) // 100, 50.0, gaps=gaps)
+            name: Sensor(motion + counts(N_SAMPLES, 1, 7 + number) // 100, 50.0, gaps=gaps)
             for number, name in enumerate(NAMES)
         }
         path = write(tmp_path / f"{n_gaps}.h5", sensors)
@@ -201,3 +202,79 @@ def test_many_gaps_of_free_running_sensors_do_not_increase_the_reads(
         assert n_segments > 10
         reads[n_gaps] = work.n_reads
     assert reads[200] <= 1.5 * reads[0]
+
+
+# --- delays from the samples -----------------------------------------------------------------
+
+
+def test_a_first_sensor_with_noise_only_does_not_prevent_refinement_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segment_pass, "_VALUES_AT_ONCE", 1)  # as if there were very many sensors
+    motion = np.cumsum(np.random.default_rng(9).standard_normal((12_000, 1)), axis=0)
+
+    def seen(seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal((12_000, 1))
+        return np.round(1e5 * (motion + 0.01 * noise)).astype(np.int32)
+
+    sensors = {
+        "a": Sensor(counts(12_000, 1, 4)),
+        "b": Sensor(seen(1)),
+        "c": Sensor(seen(2)),
+        "d": Sensor(seen(3), late=27e-3),  # nearly three samples
+    }
+    snapshot = estimate([write(tmp_path / "r.h5", sensors)], Settings(segment=4.0))
+    assert [clock.refined for clock in snapshot.clocks] == [False, False, True, True]
+    apart = snapshot.drift[:, 3:] - snapshot.drift[:, 2:3]
+    assert np.abs(apart).max() < 1e-4  # 2.7e-2 by arrival times
+
+
+@pytest.mark.parametrize(
+    ("late", "missed"),
+    [
+        pytest.param(2e-4, 0, marks=pytest.mark.long),
+        pytest.param(7.3e-3, 0, marks=pytest.mark.long),
+        (7.3e-3, 130),
+    ],
+)
+def test_a_sensor_connected_twice_is_reported_and_does_not_stop_the_estimate(
+    tmp_path: Path, late: float, missed: int
+) -> None:
+    motion = np.cumsum(np.random.default_rng(1).standard_normal((16_000, 2)), axis=0)
+
+    def seen(seed: int) -> NDArray[np.int32]:
+        noise = np.random.default_rng(seed).standard_normal(motion.shape)
+        return np.round(1e4 * (motion + 0.05 * noise)).astype(np.int32)
+
+    twice = seen(2)
+    sensors = {n: Sensor(c) for n, c in (("a", seen(1)), ("b", twice), ("c", seen(3)))}
+    restarts = (6000,) if missed else ()  # of one of the wires
+    sensors["d"] = Sensor(twice[missed:], start=missed / 100.0, late=late, restarts=restarts)
+    methods = ("three-sensor", "maximum-likelihood")
+    path = write(tmp_path / "r.h5", sensors)
+    snapshot = estimate([path], Settings(segment=4.0, methods=methods))
+    copies = snapshot.diagnostics.advice[0]
+    assert isinstance(copies, Copies)
+    assert copies.channels == ((2, 6), (3, 7))  # d's and b's
+    apart = snapshot.drift[:, 4] - snapshot.drift[:, 2]
+    assert np.abs(apart - missed / 100.0).max() < 1e-6
+    for method in methods:
+        assert np.isfinite(snapshot.results[method].noise_psd[4:160, [0, 1, 4, 5]]).all()
+
+
+def test_coarse_counts_equal_by_chance_do_not_make_one_sensor(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    tones, phases = rng.uniform(0.5, 40.0, (100, 1)), rng.uniform(0.0, 2 * np.pi, (100, 1))
+
+    def seen(ppm: float) -> Sensor:  # without noise, from the same instant on
+        rate = 100.0 * (1 + ppm * 1e-6)
+        motion = np.sin(2 * np.pi * tones * np.arange(12_000) / rate + phases).sum(axis=0)
+        return Sensor(np.round(motion / 14)[:, None].astype(np.int32), rate=rate, nominal=100.0)
+
+    sensors = {"a": seen(0.0), "b": seen(10.0)}
+    assert np.array_equal(sensors["a"].counts[:500], sensors["b"].counts[:500])
+    with Recording.open(write(tmp_path / "r.h5", sensors)) as recording:
+        rates = [state.ppm for state in AlignedRecording(recording).clocks]
+    assert rates == pytest.approx([0.0, 10.0], abs=0.01)

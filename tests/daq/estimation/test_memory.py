@@ -1,4 +1,4 @@
-"""Memory of following for days: what is kept, and what steps take for a moment."""
+"""Memory: of following for days, of single steps, and of single segments of many recordings."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import pytest
 
 from daq.clocks.kalman import Observations, smooth
 from daq.estimation.estimation import bytes_of
+from daq.estimation.snapshot_builder import keep_few
 from estimator.checks.disturbed_segments import FREQUENCIES, SegmentCourse
 from estimator.checks.stability import stability
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import HANN_HALF
 from estimator.spectra.parts import Part, Parts
-from estimator.spectra.welch import SegmentSpectra
+from estimator.spectra.welch import MAX_SEGMENTS, SegmentSpectra, kept_rows
 from tests.traced_memory import peak_of
 from tests.waiting import python
 
@@ -144,3 +145,33 @@ def test_kept_segments_are_one_array() -> None:
 
     assert peak_of(add) < 0.8 * kept.most * one.nbytes  # of numbers half as large
     assert kept.values().shape == (len(kept), 40, 9)
+
+
+# --- single segments of many recordings ------------------------------------------------------
+
+
+def _recordings(n_recordings: int, n_segments: int) -> list[SegmentSpectra]:
+    """Return spectra whose values are the numbers of their segments."""
+    kept = []
+    for _ in range(n_recordings):
+        spectra = SegmentSpectra(np.array([2]), 1)
+        values = np.arange(n_segments)
+        spectra.add(values.reshape(-1, 1, 1) + 0j, values)
+        kept.append(spectra)
+        keep_few(kept)
+    return kept
+
+
+@pytest.mark.parametrize("n_recordings", [1, 2, 5, 11])
+def test_segments_of_all_recordings_are_kept_within_the_limit_of_one(n_recordings: int) -> None:
+    n_segments = MAX_SEGMENTS - 5
+    kept = _recordings(n_recordings, n_segments)
+    assert sum(map(len, kept)) <= MAX_SEGMENTS
+    assert sum(map(len, kept)) > MAX_SEGMENTS / 2 - n_recordings
+    (every,) = {each.every for each in kept}
+    for each in kept:
+        assert np.array_equal(each.values().real.ravel(), kept_rows(n_segments, every))
+
+
+def test_few_segments_of_several_recordings_are_all_kept() -> None:
+    assert [each.every for each in _recordings(3, 100)] == [1, 1, 1]

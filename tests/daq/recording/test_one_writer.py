@@ -1,4 +1,4 @@
-"""A recording has one writer, keeps its name, and is safe when it says that it is closed."""
+"""A recording has one writer, and is safe when it says that it is closed."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from daq.recording.reader import Recording
 from daq.recording.repair import repair, verify
 from daq.recording.storage.journal import journal_path
 from daq.recording.storage.locking import is_being_written
+from daq.recording.storage.retries import PAUSES, repeated
 from daq.recording.storage.superblock import Superblock, lookup3
 from daq.recording.writer import RecordingWriter, make_datasets
 
@@ -123,3 +124,33 @@ def test_many_who_look_at_once_see_no_writer(tmp_path: Path) -> None:
     path.touch()
     with ThreadPoolExecutor(16) as some:
         assert not any(some.map(is_being_written, [path] * 2000))
+
+
+# --- a disk that refuses ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_failures", [0, 1, len(PAUSES)])
+def test_a_write_is_repeated_until_it_succeeds(
+    n_failures: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls: list[str] = []
+
+    def write() -> None:
+        calls.append("write")
+        if calls.count("write") <= n_failures:
+            raise OSError(28, "No space left on device")
+
+    slept: list[float] = []
+    repeated(write, before=lambda: calls.append("before"), sleep=slept.append)
+    assert calls == ["write"] + ["before", "write"] * n_failures
+    assert slept == list(PAUSES[:n_failures])
+    said = "a write to the recording failed and is repeated: No space left on device"
+    assert caplog.messages == [said] * n_failures
+
+
+def test_a_persistent_error_is_raised() -> None:
+    def write() -> None:
+        raise OSError(5, "Input/output error")
+
+    with pytest.raises(OSError, match="Input/output error"):
+        repeated(write, sleep=lambda _: None)

@@ -26,7 +26,7 @@ from daq.recording.signing import (
 )
 from tests.command import huddle
 from tests.tui.service.bench_files import HOURLY, bench_of
-from tests.tui.service.test_continuations import record
+from tests.tui.service.test_healing import record
 from tui.commands.main import app
 
 

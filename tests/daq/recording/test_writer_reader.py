@@ -1,8 +1,9 @@
-"""What is written is what is read, while it grows and afterwards."""
+"""What is written is what is read, while it grows and afterwards; secrets are not written."""
 
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -14,11 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.bench.channel import Channel
+from daq.bench.loading import parse
 from daq.bench.response import PolesZeros
 from daq.errors import NotARecordingError, RecordingError
 from daq.protocols.block import Block, BlockFlag, Event, EventKind, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
+from daq.recording.repair import verify
 from daq.recording.storage.locking import is_being_written
 from daq.recording.writer import RecordingWriter
 
@@ -313,3 +316,62 @@ def test_a_truncated_file_is_refused(closed: Path, kept: float) -> None:
     with closed.open("r+b") as file:
         file.truncate(int(kept * size))
     assert ("truncated" if kept else "expected an HDF5 file") in refusal(closed)
+
+
+# --- secrets of a bench file -----------------------------------------------------------------
+
+
+BENCH = """
+name = "lab"  # a comment that stays
+sampling_rate = 100.0
+{hooks}
+[[sensors]]
+name = "a"
+driver = "epson"
+port = "x"
+channels = [{{name = "x", sensitivity = 1.0}}]
+
+[storage]
+keep_runs = 5
+"""
+
+
+@pytest.mark.parametrize(
+    "hooks",
+    [
+        '[hooks]\non_finished = ["curl", "s3cret"]\n[metrics]\nport = 1',
+        'hooks.on_failed = ["s3cret"]\nmetrics.port = 1',
+        'hooks = {on_failed = ["s3cret"], retries = 2}',
+    ],
+)
+def test_hooks_and_metrics_are_not_recorded(
+    tmp_path: Path, hooks: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = parse(BENCH.format(hooks=hooks), tmp_path / "lab.toml")
+    assert bench.hooks.retries
+    layout = SensorLayout("a", bench.sensors[0].channels, 100.0, np.dtype("i4"))
+    path = tmp_path / "r.h5"
+    RecordingWriter.create(path, bench, sensors=[layout], created=HostTime(1, 2)).close()
+    assert b"s3cret" not in path.read_bytes()
+    with Recording.open(path) as recording, caplog.at_level(logging.WARNING):
+        assert "# a comment that stays" in recording.bench_text
+        assert recording.bench is not None
+        assert recording.bench.sensors == bench.sensors
+        assert recording.bench.storage == bench.storage
+    assert not caplog.records
+
+
+def test_a_recording_with_hooks_warns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("daq.recording.writer.recorded_text", lambda bench: bench.text)
+    bench = parse(BENCH.format(hooks='[hooks]\non_failed = ["x"]'), tmp_path / "lab.toml")
+    layout = SensorLayout("a", bench.sensors[0].channels, 100.0, np.dtype("i4"))
+    path = tmp_path / "r.h5"
+    RecordingWriter.create(path, bench, sensors=[layout], created=HostTime(1, 2)).close()
+    with caplog.at_level(logging.WARNING):
+        Recording.open(path).close()
+        Recording.open(path).close()
+    (said,) = caplog.records  # once
+    assert "holds [hooks] of its bench file" in said.getMessage()
+    assert "holds [hooks] of its bench file" in verify(path).warning

@@ -1,17 +1,26 @@
-"""The views: switched by keys, each with its own keys and help, and what stays where."""
+"""The views: switched by keys, each with its own help, and as docs/session.md shows them."""
 
 from __future__ import annotations
 
-import pytest
+import re
+from pathlib import Path
 
-from tests.tui.application.screen_text import assert_looks_as_before, screen_text
+import pytest
+from textual.binding import Binding
+
+from tests.tui.application.screen_text import FOLDER, assert_looks_as_before, screen_text
 from tests.tui.application.test_app import ended, opened, pressed, running, settled, shown
 from tests.tui.application.test_bench_view import SOUND, Reading
 from tests.tui.application.test_recordings import entries
 from tests.tui.example_snapshot import LIMIT, ProgressCallback, demo_bench
 from tests.waiting import limit
+from tui.application.app import HuddleApp
+from tui.application.bench_view.view import BenchView
 from tui.application.messages import CatalogueRead
+from tui.application.recordings_view.view import RecordingsView, RecordingTable
+from tui.application.result_view.view import ResultView
 from tui.application.state import RESULT, TEST, TITLES, VIEWS
+from tui.application.test_view.view import TestView
 
 
 async def test_keys_switch_views_and_each_has_its_keys_and_its_help(told: ProgressCallback) -> None:
@@ -113,3 +122,44 @@ async def test_pictures(told: ProgressCallback, name: str, size: tuple[int, int]
         app.screen.post_message(CatalogueRead(entries(told.folder)))
         await shown(pilot, app)
         await assert_looks_as_before(pilot, f"{name}-recordings")
+
+
+# --- docs/session.md -------------------------------------------------------------------------
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = (DOCS / "session.md").read_text(encoding="utf-8")
+SCREENS = dict(re.findall(r"^## (.*?)\n.*?```text\n(.*?)\n```", PAGE, re.MULTILINE | re.DOTALL))
+VIEW_KEYS = [
+    {
+        binding.description
+        for bindings in (view.BINDINGS, HuddleApp.BINDINGS, RecordingTable.BINDINGS)
+        for binding in bindings
+        if isinstance(binding, Binding)
+    }
+    for view in (BenchView, TestView, ResultView, RecordingsView)
+]
+HEADING = re.compile(r"^ *(?:sensor|channel|started, UTC) +\w.*", re.MULTILINE)
+AGAIN = "make session drives it again"
+
+
+def headings(text: str) -> set[str]:
+    """Return the words above the columns of the tables on a screen."""
+    words = {word for line in HEADING.findall(text) for word in line.split()}
+    return {word for word in words if word.strip(".,").isalpha()}
+
+
+def test_each_step_of_the_session_has_its_screen() -> None:
+    steps = (DOCS / "images" / "session.py").read_text(encoding="utf-8")
+    assert list(SCREENS) == re.findall(r'session\.keep\(\s*"(.*?)"', steps), AGAIN
+
+
+@pytest.mark.parametrize("name", SCREENS)
+def test_titles_keys_and_columns_are_those_of_today(name: str) -> None:
+    rows = SCREENS[name].splitlines()
+    views = "  ".join(f"{number} {TITLES[view]}" for number, view in enumerate(VIEWS, start=1))
+    assert rows[0].startswith(f"  {views}  "), AGAIN
+    keys = {item.partition(" ")[2] for item in re.split(r" {2,}", rows[-1].strip())}
+    assert any(keys <= known for known in VIEW_KEYS), AGAIN
+    pictures = (path.read_text(encoding="utf-8") for path in FOLDER.glob("*.txt"))
+    assert headings(SCREENS[name]) <= set().union(*map(headings, pictures)), AGAIN

@@ -1,4 +1,4 @@
-"""Chunks that are read past HDF5 give the same rows, and damage never gives others."""
+"""Chunks that are read and written past HDF5 give the same rows; damage never gives others."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from daq.recording import sensor_record
+from daq.recording.chunks.chunk_writer import AppendedRows, ChunkBuffer
 from daq.recording.sensor_record import ChunkedRows, LocatedChunks
 from daq.recording.storage import packing
 
@@ -259,3 +260,39 @@ def test_a_chunk_far_larger_than_its_rows_is_left_to_hdf5(tmp_path: Path) -> Non
         located = LocatedChunks(file["rows"])
         assert located.stored(0, 1) is None
         assert located.stored(1, 1) is not None
+
+
+# --- rows written past h5py ------------------------------------------------------------------
+
+
+ROWS = np.arange(12).reshape(4, 3)
+LAYOUTS = {
+    "another type": ROWS.astype("i4"),
+    "the other byte order": ROWS.astype(">i8"),
+    "columns first": np.asfortranarray(ROWS),
+    "every other row": np.repeat(ROWS, 2, axis=0)[::2],
+    "floating point": ROWS.astype("f8"),
+}
+
+
+@pytest.mark.parametrize("rows", LAYOUTS.values(), ids=LAYOUTS)
+def test_rows_of_another_layout_are_converted(tmp_path: Path, rows: np.ndarray[Any, Any]) -> None:
+    with h5py.File(tmp_path / "rows.h5", "w") as file:
+        dataset = file.create_dataset("rows", (0, 3), "i8", maxshape=(None, 3), chunks=(4, 3))
+        appended = AppendedRows(dataset)
+        appended.extend(len(rows))
+        appended.write(0, rows)
+        assert np.array_equal(dataset[()], ROWS)
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 5, 11])
+def test_blocks_of_any_size_fill_chunks(tmp_path: Path, size: int) -> None:
+    rows = np.arange(66, dtype="i4").reshape(22, 3)
+    with h5py.File(tmp_path / "rows.h5", "w") as file:
+        dataset = file.create_dataset("rows", (0, 3), "i4", maxshape=(None, 3), chunks=(4, 3))
+        buffer = ChunkBuffer(dataset)
+        for first in range(0, len(rows), size):
+            buffer.add(rows[first : first + size])
+            assert buffer.n_written == min(first + size, len(rows)) // 4 * 4
+        buffer.finish()
+        assert np.array_equal(dataset[()], rows)
