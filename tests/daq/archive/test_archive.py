@@ -468,7 +468,7 @@ def test_what_is_known_of_sensitivities_is_in_the_intervals(
         assert found.levels.high[0, 0, 0] > 1.35 * found.levels.mean[0, 0, 0]
 
 
-@pytest.mark.parametrize("reject", [False, True])
+@pytest.mark.parametrize("reject", [pytest.param(False, marks=pytest.mark.long), True])
 def test_segments_that_a_channel_lacks_are_named(tmp_path: Path, *, reject: bool) -> None:
     n, third = round(0.3 * 3600 * RATE), round(0.1 * 3600 * RATE)
     path = record(tmp_path / "r.h5", hours=0.3, absent={"B": [(1, third, 2 * third)]})

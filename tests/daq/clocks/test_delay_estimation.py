@@ -95,7 +95,7 @@ def test_a_reference_without_the_common_motion_is_replaced(dead: bool) -> None:
         assert np.median(std[:, ({0, 1, 2} - set(others)).pop()]) > 1e-4
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_hum_does_not_shift_sensors_by_half_periods(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 120 * HOP + LENGTH
@@ -127,7 +127,7 @@ def test_too_few_segments_define_no_frame() -> None:
 
 
 @pytest.mark.parametrize(("noise", "is_known"), [(None, False), (1.5, True)])
-@pytest.mark.parametrize(("n_segments", "hop"), [(24, 3000), (100, 3000), (60, 1500)])
+@pytest.mark.parametrize(("n_segments", "hop"), [(24, 3000), (60, 1500)])
 def test_noise_of_many_frequencies_is_no_motion(
     n_segments: int, hop: int, noise: float | None, *, is_known: bool
 ) -> None:

@@ -114,7 +114,7 @@ def test_a_step_of_the_stated_time_keeps_every_row_of_gcf(size: float) -> None:
     assert restart.first_sample == 7700
 
 
-@pytest.mark.parametrize("ppm", [60.0, -400.0, 400.0])
+@pytest.mark.parametrize("ppm", [-400.0, 400.0])
 def test_an_oscillator_off_its_rate_loses_no_row_and_makes_no_gap(ppm: float) -> None:
     digitizer = Digitizer(seconds=700.0, ppm=ppm)
     blocks, events = check(by_seedlink(digitizer), digitizer)

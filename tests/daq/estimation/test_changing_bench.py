@@ -230,8 +230,8 @@ def test_of_few_averages_a_change_is_named_and_opens_the_interval(*, octaves: bo
 @pytest.mark.parametrize(
     ("kind", "channel", "least", "ratio", "option"),
     [
-        ("jitter", None, 0.01, 1e4, ""),  # of segments of 5 s, weighted by the window
-        ("jitter", None, 0.01, 1e6, ""),
+        pytest.param("jitter", None, 0.01, 1e4, "", marks=pytest.mark.long),
+        ("jitter", None, 0.01, 1e6, ""),  # of segments of 5 s, weighted by the window
         ("halves", 3, 0.02, 1e4, ""),
         ("halves", 3, 0.02, 1e4, "octaves"),
         ("halves", 3, 0.02, 1e4, "reject"),
@@ -274,6 +274,7 @@ def test_changes_are_found_with_every_option(option: str) -> None:
     assert np.mean(((noise.low <= NOISE) & (noise.high >= NOISE))[known]) > 0.93
 
 
+@pytest.mark.long
 def test_gains_that_follow_one_temperature_bound_bands_without_a_noise_that_is_known() -> None:
     outcome = one(("gains follow one temperature, 2 % rms",), 60, 3, 1)
     assert outcome.held > 0.93 * outcome.n_levels

@@ -66,7 +66,6 @@ def recording(
         ({"clocks": "nominal"}, {"gaps": ((3500, 3520), (4500, 4505))}),
         ({"clocks": "nominal", "octaves": True}, {}),
         ({"clocks": "nominal", "reject": True}, {}),
-        ({"clocks": "nominal", "reject": False}, {}),
         ({}, {}),
         ({}, {"utc": True}),
     ],
@@ -108,7 +107,7 @@ def test_facts_are_about_the_samples_that_are_used(
     assert "channels-clipped" in invalidating(path, Settings(segment=1.0, start=start, end=end))
 
 
-@pytest.mark.parametrize("rate", [50, 125, 200, 250, 1000])
+@pytest.mark.parametrize("rate", [125, 250])
 def test_a_stretch_ends_where_it_says_at_any_rate(tmp_path: Path, rate: int) -> None:
     counts = np.random.default_rng(4).normal(0, 30, (3, 20 * rate, 1)).astype(np.int32)
     sensors = {name: Sensor(each, rate) for name, each in zip("ABC", counts, strict=True)}

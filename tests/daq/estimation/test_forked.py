@@ -97,7 +97,9 @@ def _compare(path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, jo
     [
         (2, {}, (280, 300)),
         (3, {"start": ODD, "exclude": ("100s/107s",)}, (250, 284)),
-        (2, {"window": "rectangular", "overlap": 0.0}, (120, 150)),
+        pytest.param(
+            *(2, {"window": "rectangular", "overlap": 0.0}, (120, 150)), marks=pytest.mark.long
+        ),
     ],
 )
 def test_sums_are_equal_to_the_bit(

@@ -434,7 +434,7 @@ def test_a_step_in_the_middle_is_not_taken_for_noise(
 
 
 @pytest.mark.parametrize(
-    "ppm", [0.3, *(pytest.param(ppm, marks=LONG) for ppm in (3.0, 60.0)), 500.0]
+    "ppm", [0.3, *(pytest.param(ppm, marks=LONG) for ppm in (3.0, 60.0, 500.0))]
 )
 def test_drifts_of_any_rate_are_looked_at_closely(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ppm: float

@@ -82,8 +82,7 @@ def taken(path: Path, at: str = "2026-01-10") -> ChannelResponse:
     return found
 
 
-@pytest.mark.parametrize("order", [1, -1])
-@pytest.mark.parametrize("ends", [True, False])
+@pytest.mark.parametrize(("order", "ends"), [(1, False), (-1, True)])
 def test_the_epoch_of_the_data_counts(tmp_path: Path, order: int, *, ends: bool) -> None:
     epochs = [(start, end if ends else None, gain) for start, end, gain in EPOCHS[::order]]
     assert sensitivity(tmp_path, epochs, "2026-01-10") == 2000

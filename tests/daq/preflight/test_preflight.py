@@ -168,8 +168,9 @@ def test_a_sensor_on_another_floor_is_found_however_late_its_samples_are(late: i
     assert (Problem.ALONE, "C", "") in failures([a, b, replace(c, samples=other)])
 
 
-@pytest.mark.parametrize("late", [-1.3, -0.12, 0.12, 1.3])
-@pytest.mark.parametrize("rate", [50.0, 128.0, 200.0])
+@pytest.mark.parametrize(
+    ("late", "rate"), [(-1.3, 50.0), (-0.12, 128.0), (0.12, 200.0), (1.3, 128.0)]
+)
 def test_devices_that_send_packets_late_or_have_another_rate_share_the_motion(
     late: float, rate: float
 ) -> None:

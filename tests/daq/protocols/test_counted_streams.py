@@ -38,10 +38,7 @@ def reads(taken: NDArray[np.float64], rng: np.random.Generator) -> list[tuple[in
     return found
 
 
-@pytest.mark.parametrize(
-    ("modulus", "ppm"),
-    [(256, -10_000), (256, 0), (256, 900), (65_536, -10_000), (65_536, 900)],
-)
+@pytest.mark.parametrize(("modulus", "ppm"), [(256, -10_000), (256, 900), (65_536, -10_000)])
 def test_every_frame_of_a_counter_off_its_rate_has_its_index(modulus: int, ppm: float) -> None:
     rng = np.random.default_rng(round(abs(ppm)) + modulus)
     sent, taken = frames(ppm, 1500, rng)

@@ -244,7 +244,7 @@ def test_only_recordings_that_lack_rows_of_channels_need_a_later_program(
     assert layout.format_version == version
 
 
-@pytest.mark.parametrize("offset", [5, 12, 20, 30])
+@pytest.mark.parametrize("offset", [5, 20])
 def test_a_damaged_header_is_damage(tmp_path: Path, offset: int) -> None:
     path = tmp_path / "r.h5"
     make_recording(path)

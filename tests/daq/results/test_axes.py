@@ -195,7 +195,9 @@ def held(method: str, seed: int) -> tuple[list[bool], list[bool]]:
     )
 
 
-@pytest.mark.parametrize("method", ["two-channel", "three-channel", "three-sensor"])
+@pytest.mark.parametrize(
+    "method", ["two-channel", "three-sensor", pytest.param("three-channel", marks=pytest.mark.long)]
+)
 def test_intervals_hold_the_truth_with_sensitivities_off_as_stated(method: str) -> None:
     """Of 24 intervals 23 should; 20 leaves room for chance (p = 0.01)."""
     draws = [held(method, seed) for seed in range(8)]

@@ -16,7 +16,7 @@ from tests.waiting import limit
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
-@pytest.mark.parametrize("leads", [False, True])
+@pytest.mark.parametrize("leads", [pytest.param(False, marks=pytest.mark.long), True])
 def test_it_ends_with_its_terminal(tmp_path: Path, leads: bool) -> None:
     """It gets no SIGHUP, or ignores it where it leads a session, and gets SIGCONT."""
     import fcntl  # noqa: PLC0415 - not on Windows

