@@ -21,7 +21,7 @@ from daq.devices.interface import DeviceInformation
 from daq.preflight.preview import SensorPreview
 from tests.tui.application.screen_text import assert_looks_as_before, screen_text
 from tests.tui.application.test_app import NARROW, WIDE, opened, pressed, settled, shown
-from tests.tui.application.test_attach import until
+from tests.tui.application.test_first_bench import until
 from tests.tui.example_snapshot import SETTINGS, ProgressCallback, demo_bench
 from tests.waiting import limit
 from tui.application.app import HuddleApp

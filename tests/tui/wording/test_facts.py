@@ -1,4 +1,4 @@
-"""Every kind of fact has words, and every renderer shows every kind by the same words."""
+"""Facts, advice and flags: every kind has words, and every renderer shows the same words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +16,18 @@ from rich.console import Console
 from scipy.linalg import block_diag
 
 import huddle
+from daq.clocks.clock_model import ClockSource
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Bridged, Octave, Snapshot
 from daq.estimation.snapshot_diagnostics import SnapshotDiagnostics, Synchronisation
 from daq.results.facts.all_facts import ranked
 from daq.results.facts.fact import Fact, Finding
-from daq.results.facts.methods import MethodRefused
+from daq.results.facts.methods import WITHOUT_ESTIMATE, MethodRefused
 from daq.results.facts.model import ModelPasses
 from daq.results.facts.recordings import _OF_CAVEATS, BlocksDamaged, SensorsSimulated
 from daq.results.facts.segments import GapsBridged
 from daq.results.result import Result
+from daq.results.vocabulary import FLAG_WORDS
 from estimator.checks.advice import Advice, Rank, Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.self_noise.result import Flag
@@ -35,16 +37,21 @@ from tests.tui.example_snapshot import (
     STRANGER,
     diagnosed,
     empty_snapshot,
+    made_now,
     made_snapshot,
     rotation,
+    said,
 )
 from tests.tui.night_recording import record
 from tests.tui.report.written_report import assert_as_kept, result_of
-from tests.tui.wording.advice_examples import MISFIT
+from tests.tui.wording.advice_examples import EXAMPLES as ADVICE
+from tests.tui.wording.advice_examples import LEADS, MISFIT, ROTATED, names
 from tests.tui.wording.fact_examples import EXAMPLES, FINDINGS, kinds
 from tui.application.result_view.result_text import result
 from tui.application.state import State
-from tui.application.test_view.panels import findings
+from tui.application.test_view.panels import findings, sensor_table
+from tui.application.test_view.plotted import Choice
+from tui.output.console import console
 from tui.output.diagnosis import details
 from tui.output.json_document import document
 from tui.output.json_values import json_text
@@ -324,3 +331,86 @@ def test_a_method_that_waits_for_averages_invalidates_no_test_that_goes_on() -> 
             each for each in Result(snapshot, SETTINGS).facts if isinstance(each, MethodRefused)
         )
         assert refused.rank is rank
+
+
+# --- advice ----------------------------------------------------------------------------------
+
+
+def test_every_kind_has_words() -> None:
+    assert {type(advice) for advice in ADVICE} == kinds(Advice)
+
+
+def test_what_to_do_about_a_misfit_is_for_these_sensors() -> None:
+    three = MISFIT.words(names("a", "b", "c")).action
+    assert "triaxial data" not in three
+    assert "--dimension auto" not in three
+    planar = MISFIT.words(names("a", "b", "c", n_channels=2)).action
+    assert "If the motion has more than 2 dimensions, sensors of 2 channels must point" in planar
+    assert "use triaxial data" in planar
+    five = MISFIT.words(names(*"abcde")).action
+    assert "5 sensors allow more dimensions (--dimension auto)" in five
+    assert "--method auto" in MISFIT.words(names(*"abcde")).line
+    axes = names(*"abcd", n_channels=1)  # --method auto is three-sensor for them
+    assert "auto" not in MISFIT.words(axes).action + MISFIT.words(axes).line
+
+
+def test_nobody_is_told_to_synchronise_a_polled_sensor() -> None:
+    made = made_snapshot()
+    *others, last = made.clocks
+    clocks = (*others, replace(last, source=ClockSource.SAMPLE_INSTANTS))
+    words = replace(LEADS, sensors=(1, 2)).words(replace(made, clocks=clocks).names)
+    assert words.line == "B lags C by 20 ms: C is polled; let the host do less"
+    assert "C is polled, without a clock to set" in words.action
+    assert "synchronise" in LEADS.words(replace(made, clocks=clocks).names).line
+
+
+@pytest.mark.parametrize("advice", ADVICE)
+def test_alone_in_a_summary_it_is_what_it_is_alone(advice: Advice) -> None:
+    who = names("a", "b", "c")
+    fact = Finding(rank=Rank.TO_KNOW, findings=(advice,), names=who)
+    assert fact.words == advice.words(who)
+
+
+def test_of_very_many_pairs_the_worst_are_listed() -> None:
+    sensors = tuple(f"S{number}" for number in range(15))
+    advice = [
+        replace(ROTATED, sensors=pair, angle_deg=float(n), horizontal_deg=float("nan"))
+        for n, pair in enumerate(combinations(range(15), 2))
+    ]
+    line = str(advice[0].together(advice, names(*sensors)))
+    assert line.startswith(
+        "Sensors are rotated against each other (S13–S14 104.000°, S12–S14 103.000°"
+    )
+    assert "and less in 95 more pairs): no bias" in line
+    assert line.count("°") == 10
+
+
+# --- flags -----------------------------------------------------------------------------------
+
+
+def test_every_flag_has_words_of_its_own() -> None:
+    assert set(FLAG_WORDS) == set(Flag)
+    assert len({words.short for words in FLAG_WORDS.values()}) == len(Flag)
+    assert len({words.long for words in FLAG_WORDS.values()}) == len(Flag)
+
+
+@pytest.mark.parametrize("flag", Flag)
+def test_table_and_remarks_take_their_words_from_one_place(flag: Flag) -> None:
+    snapshot = made_snapshot()
+    noise = snapshot.results["three-sensor"]
+    flags = noise.flags.copy()
+    flags[:, 4] = flag  # B.Y
+    flags[3:, 5] = 0
+    results = {"three-sensor": replace(noise, flags=flags)}
+    snapshot = replace(snapshot, results=results)
+    choice = Choice(methods=("three-sensor",))
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), choice, width=150)
+    screen = console()
+    with screen.capture() as shown:
+        screen.print(table, width=150)
+    without = bool(flag & WITHOUT_ESTIMATE)
+    assert (f"Y {FLAG_WORDS[flag].short}" in shown.get()) == without
+    line = f"three-sensor: B.Y: {FLAG_WORDS[flag].long}, at all frequencies."
+    assert any(each.startswith(line) for each in said(snapshot)) == (
+        without or flag is Flag.NOT_CONVERGED
+    )
