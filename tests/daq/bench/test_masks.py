@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.bench.loading import load, parse
@@ -140,6 +140,7 @@ def test_files_that_are_no_masks_are_refused(text: str, said: str, tmp_path: Pat
     assert str(error.value).startswith(f"{path}: {said}")
 
 
+@settings(max_examples=40)
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_mask_or_refused(content: bytes) -> None:
     from tempfile import TemporaryDirectory  # noqa: PLC0415 - a fixture lasts over all examples

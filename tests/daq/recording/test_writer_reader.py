@@ -166,7 +166,7 @@ def test_small_blocks_become_rows_of_a_tenth_of_a_second(tmp_path: Path) -> None
         assert blocks["monotonic_ns"].tolist() == [at(n).monotonic_ns for n in (10, 20, 26, 30)]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.integers(1, 350), min_size=1, max_size=12), st.sets(st.integers(0, 11)))
 def test_any_blocks_and_commits(
     tmp_path_factory: pytest.TempPathFactory, lengths: list[int], commits: set[int]

@@ -515,6 +515,7 @@ def test_the_application_logs_to_a_file_only() -> None:
     assert "--log-file" in CliRunner().invoke(app, ["tui", "--help-all"]).output
 
 
+@pytest.mark.long
 @pseudo_terminals
 def test_json_is_all_there_is_on_standard_error(bench: Path, tmp_path: Path) -> None:
     done = subprocess.run(
