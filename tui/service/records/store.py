@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from datetime import date, datetime
 from functools import lru_cache
@@ -54,21 +54,18 @@ CREATE TABLE IF NOT EXISTS noise (
     run TEXT NOT NULL REFERENCES runs (key), sensor TEXT, model TEXT, serial_number TEXT,
     channel TEXT, unit TEXT, method TEXT, low_hz REAL, high_hz REAL, psd REAL, low REAL, high REAL);
 CREATE INDEX IF NOT EXISTS noise_by_run ON noise (run);
-"""
-_INDEXES = """
 CREATE TABLE IF NOT EXISTS identities (
     part TEXT PRIMARY KEY, run TEXT NOT NULL, run_id TEXT NOT NULL, root_sha256 TEXT NOT NULL);
 CREATE INDEX IF NOT EXISTS runs_by_time ON runs (due, entry);
 CREATE INDEX IF NOT EXISTS runs_by_state ON runs (bench, state, due);
 CREATE INDEX IF NOT EXISTS runs_pending ON runs (bench) WHERE untold != '[]';
 """ + "".join(f"CREATE TABLE IF NOT EXISTS {each} (run TEXT PRIMARY KEY);" for each in Caveat)
-"""Made by whoever writes: with another version, earlier programs would refuse the database."""
-_COLUMNS = (
-    *("key", "bench", "entry", "due", "state", "reason", "verdict", "started", "ended"),
-    *("duration", "target_cov", "queue", "parts", "attempts", "pinned", "removed", "untold"),
-)
-# `untold` holds Run.pending_hooks: renamed, earlier versions could not open the database.
 _NOISE = tuple(field.name for field in fields(RecordedNoise))
+_CAVEATS = ", ".join(
+    f"EXISTS (SELECT 1 FROM {each} WHERE run = runs.key)"  # noqa: S608 - our own words
+    for each in Caveat
+)
+"""The questions whether a run has each caveat."""
 _STATES = ", ".join(f"'{state}'" for state in RunState)
 _DATES = " OR ".join(
     f"({name} IS NOT NULL AND julianday({name}) IS NULL)"
@@ -162,22 +159,8 @@ class RunStore:
 
     def identities(self) -> dict[str, tuple[str, str]]:
         """Return run id and root SHA-256 of recordings, by file name."""
-        if not self._has("identities"):
-            return {}
         rows = self._rows("SELECT part, run_id, root_sha256 FROM identities")
         return {part: (run_id, root) for part, run_id, root in rows}
-
-    def _has(self, table: str) -> bool:
-        """Whether a table is there: earlier versions had fewer."""
-        return bool(self._rows("SELECT 1 FROM sqlite_master WHERE name = ?", table))
-
-    @property
-    def _caveats(self) -> str:
-        """The questions whether a run has each caveat."""
-        return ", ".join(
-            f"EXISTS (SELECT 1 FROM {each} WHERE run = runs.key)" if self._has(each) else "0"  # noqa: S608
-            for each in Caveat
-        )
 
     def forget_planned(self, run: Run) -> None:
         """Remove a run that is no longer in the schedule, unless it has begun."""
@@ -245,9 +228,9 @@ class RunStore:
     def parts(self) -> set[str]:
         """Return the file names of the recordings of all runs."""
         return {
-            _safe_name(name)
-            for (names,) in self._rows("SELECT parts FROM runs WHERE parts != '[]'")
-            for name in json.loads(names)
+            name
+            for (stored,) in self._rows("SELECT parts FROM runs WHERE parts != '[]'")
+            for name in _safe_names(stored)
         }
 
     def noise(
@@ -264,7 +247,7 @@ class RunStore:
         where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
         columns = ", ".join(f"noise.{name}" for name in _NOISE)
         rows = self._rows(
-            f"SELECT bench, due, {self._caveats}, {columns}"  # noqa: S608 - our own words
+            f"SELECT bench, due, {_CAVEATS}, {columns}"  # noqa: S608 - our own words
             " FROM runs CROSS JOIN noise ON noise.run = runs.key"
             f"{where} ORDER BY due, entry, noise.rowid",
             *values,
@@ -292,7 +275,7 @@ class RunStore:
         condition = f" WHERE {' AND '.join(where)}" if where else ""
         order = "due, entry" if last is None else f"due DESC, entry DESC LIMIT {last:d}"
         rows = self._rows(
-            f"SELECT {', '.join(_COLUMNS)}, {self._caveats}"  # noqa: S608 - our own words
+            f"SELECT {', '.join(_COLUMNS)}, {_CAVEATS}"  # noqa: S608 - our own words
             f" FROM runs{condition} ORDER BY {order}",
             *values,
         )
@@ -443,8 +426,6 @@ class RunStore:
         with self._opened() as database:
             database.execute("BEGIN IMMEDIATE")
             before = self._state()
-            for index in filter(None, map(str.strip, _INDEXES.split(";"))):
-                database.execute(index)
             yield database
             database.execute("COMMIT")
         if before == self._known:
@@ -499,53 +480,21 @@ def _check(path: Path) -> str:
         return "" if database.execute("SELECT 1 FROM runs LIMIT 1").fetchone() else EMPTY
 
 
-def _row(run: Run) -> dict[str, Any]:
-    return {
-        "key": run.key,
-        "bench": run.bench,
-        "entry": run.entry,
-        "due": utc_text(run.due),
-        "state": str(run.state),
-        "reason": run.reason,
-        "verdict": run.verdict,
-        "started": utc_text(run.started),
-        "ended": utc_text(run.ended),
-        "duration": run.duration,
-        # a number where it is a precision alone: earlier versions read that
-        "target_cov": run.until.text if run.until.decided else run.until.cov,
-        "queue": int(run.queue),
-        "parts": json.dumps(run.parts),
-        "attempts": run.attempts,
-        "pinned": int(run.pinned),
-        "removed": utc_text(run.removed),
-        "untold": json.dumps(run.pending_hooks),
-    }
+def _same(value: Any) -> Any:  # noqa: ANN401 - of SQLite
+    return value
 
 
-def _run(row: dict[str, Any]) -> Run:
-    return Run(
-        bench=row["bench"],
-        entry=row["entry"],
-        due=datetime.fromisoformat(row["due"]),
-        duration=row["duration"],
-        until=_until(row["target_cov"]),
-        queue=bool(row["queue"]),
-        state=RunState(row["state"]),
-        reason=row["reason"],
-        started=from_text(row["started"]),
-        ended=from_text(row["ended"]),
-        parts=tuple(_safe_name(name) for name in json.loads(row["parts"])),
-        verdict=row["verdict"],
-        attempts=row["attempts"],
-        pinned=bool(row["pinned"]),
-        removed=from_text(row["removed"]),
-        pending_hooks=tuple(json.loads(row["untold"])),
-        caveats=Caveats.of(row),
-    )
+def _end_text(until: EndCondition) -> float | str | None:
+    # a number where it is a precision alone: earlier versions read that
+    return until.text if until.decided else until.cov
 
 
-def _until(stored: float | str | None) -> EndCondition:
+def _end(stored: float | str | None) -> EndCondition:
     return EndCondition.of_text(stored) if isinstance(stored, str) else EndCondition(cov=stored)
+
+
+def _texts(stored: str) -> tuple[str, ...]:
+    return tuple(json.loads(stored))
 
 
 def _safe_name(name: str) -> str:
@@ -553,3 +502,40 @@ def _safe_name(name: str) -> str:
     if Path(name).name != name or name in {"", ".", ".."}:
         raise StoreError(f"recording {name!r}: expected a file name without a folder")
     return name
+
+
+def _safe_names(stored: str) -> tuple[str, ...]:
+    return tuple(map(_safe_name, json.loads(stored)))
+
+
+_FIELDS: dict[str, tuple[str, Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "bench": ("bench", _same, _same),
+    "entry": ("entry", _same, _same),
+    "due": ("due", utc_text, datetime.fromisoformat),
+    "state": ("state", str, RunState),
+    "reason": ("reason", _same, _same),
+    "verdict": ("verdict", _same, _same),
+    "started": ("started", utc_text, from_text),
+    "ended": ("ended", utc_text, from_text),
+    "duration": ("duration", _same, _same),
+    "target_cov": ("until", _end_text, _end),
+    "queue": ("queue", int, bool),
+    "parts": ("parts", json.dumps, _safe_names),
+    "attempts": ("attempts", _same, _same),
+    "pinned": ("pinned", int, bool),
+    "removed": ("removed", utc_text, from_text),
+    # Renamed, earlier versions could not open the database.
+    "untold": ("pending_hooks", json.dumps, _texts),
+}
+"""Columns beside the key: which attribute of a run each has, and how it is written and read."""
+_COLUMNS = ("key", *_FIELDS)
+
+
+def _row(run: Run) -> dict[str, Any]:
+    fields = {name: write(getattr(run, own)) for name, (own, write, _) in _FIELDS.items()}
+    return {"key": run.key} | fields
+
+
+def _run(row: dict[str, Any]) -> Run:
+    found = {own: read(row[name]) for name, (own, _, read) in _FIELDS.items()}
+    return Run(**found, caveats=Caveats.of(row))
