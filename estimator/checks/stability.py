@@ -416,6 +416,11 @@ def stability(
         span, time = (float(low[0]), float(high[-1])), (float(begin[0]), float(end[-1]))
         single = replace(single, band=span, time=time)
     loudness = single.loudness.joined(Loudness.of_parts(parts, maximum, psd, good))
+    without = (
+        steadied(parts, maximum, psd, good=good, insides=insides)
+        if (changes or suspect) and not is_short
+        else None
+    )
     changes, added, left = _and_unstable(
         (changes, added),
         single,
@@ -424,11 +429,6 @@ def stability(
         dims,
     )
     explained = np.maximum(explained, left)
-    without = (
-        steadied(parts, maximum, psd, good=good, insides=insides)
-        if (changes or suspect) and not is_short
-        else None
-    )
     if is_short:
         explained = _in_all_bands(explained, changes, dims)
     if without is not None:
