@@ -485,7 +485,8 @@ def data_interval(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
     psd = snapshot.data_psd
     averages = averages_at(snapshot, snapshot.frequency)[:, None]
     cumulants = np.stack([psd**k / averages ** (k - 1) for k in (2, 3, 4)])
-    edges, width = band_edges(snapshot.frequency, estimate.band), np.gradient(snapshot.frequency)
+    edges = band_edges(snapshot.frequency, estimate.band)
+    width = widths(snapshot.frequency, np.isfinite(psd), edges)
     correlation = correlation_of(estimate.settings)
     low, high = band_levels(psd, cumulants, edges, correlation, weights=width).interval()
     return low[0], high[0]
@@ -493,9 +494,10 @@ def data_interval(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
 
 def data_means(snapshot: Snapshot, band: tuple[float, float]) -> FloatArray:
     """Return the mean PSD of what each channel recorded in a band, shape (n_channels,)."""
-    inside = slice(*band_edges(snapshot.frequency, band))
-    width = np.gradient(snapshot.frequency)[inside]
-    return np.asarray(np.average(snapshot.data_psd[inside], axis=0, weights=width))
+    edges, psd = band_edges(snapshot.frequency, band), snapshot.data_psd
+    width = widths(snapshot.frequency, np.isfinite(psd), edges)[slice(*edges)]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.nansum(psd[slice(*edges)] * width, axis=0) / width.sum(axis=0))
 
 
 def judged_method(snapshot: Snapshot, settings: Settings) -> str:
