@@ -106,7 +106,7 @@ class SquaresAndCubes:
         spectra = np.fft.rfft(terms).astype(np.complex64)
         self._spectra.append(spectra[:, :, self.bins].transpose(2, 1, 0))
         if len(self._whole) * spectra[0].size < MOST_VALUES:
-            self._whole.append(spectra[0])
+            self._whole.append(spectra[0].copy())  # a view would keep squares and cubes
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
