@@ -34,10 +34,9 @@ WIDTH = 4.0
 """Highest frequency of a band over that of the next."""
 LEAST_BINS = 26
 """Least frequencies of a band."""
-NOT_WEAK, LOUD = 4.0, 50.0
-"""Power of a channel over what others do not predict, from which it is compared, and named."""
-VERY_LOUD = 1000.0
-"""The same for curves and products: noise in what is predicted bends it beside weak motion."""
+NOT_WEAK, VERY_LOUD = 4.0, 1000.0
+"""Power of what others predict of a channel over what they do not, from which it is compared; and
+for curves and products: noise in what is predicted bends it beside weak motion."""
 CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
 PART = 0.4
@@ -74,8 +73,6 @@ class Dependence:
         these gains or instants leave, or what other sensors do not predict.
     power : float
         Power that depends on the motion over that of the channel.
-    is_loud : bool
-        Whether the motion is loud enough to tell.
     """
 
     channel: int
@@ -85,7 +82,6 @@ class Dependence:
     size: float
     explained: FloatArray
     power: float
-    is_loud: bool
 
 
 def dependences(
@@ -117,7 +113,8 @@ def dependences(
     if rest is None:
         return found
     for own in _channels(sensor):
-        motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2))
+        # what others predict: own noise in it would follow itself, where it is in gusts
+        motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2)) - rest[own]
         of_sensor = _Sensor(motion, rest[own], frequency, window)
         for number, band in enumerate(_bands(frequency, highest)):
             clear = of_sensor.clearest(band, is_highest=number == 0)
@@ -125,7 +122,7 @@ def dependences(
     most = {each.band: 0.0 for each in found}
     for one in found:
         most[one.band] = max(most[one.band], one.power)
-    found = [each for each in found if each.is_loud and each.power > PART * most[each.band]]
+    found = [each for each in found if each.power > PART * most[each.band]]
     return sorted(found, key=lambda each: -each.evidence)
 
 
@@ -254,7 +251,6 @@ class _Sensor:
                 size=size,
                 explained=most.astype(np.float64),
                 power=float(share * there[channel]),
-                is_loud=bool(noise[channel] < 1 / LOUD),
             )
 
 

@@ -93,6 +93,20 @@ def test_what_bends_otherwise_is_a_curve(kind: str) -> None:
     assert not found[0].size
 
 
+@pytest.mark.parametrize("most", [1.0, 1.5])
+def test_a_channel_that_is_too_slow_for_most_of_its_motion_is_found(most: float) -> None:
+    """What it does not follow is a fifth of its power: no noise that is loud by itself."""
+    rng = np.random.default_rng(16)
+    sensors = bench(rng, 40.0, 3, 3)
+    x = sensors[1][:, 0]
+    step, at, found = most * np.diff(x).std(), x[0], []
+    for value in x.tolist():
+        at += min(max(value - at, -step), step)
+        found.append(at)
+    sensors[1][:, 0] = found
+    assert {each.channel for each in dependences(rng, sensors)} == {3}
+
+
 def test_short_gaps_that_are_filled_are_spikes_or_noise_where_motion_is_slow() -> None:
     rng = np.random.default_rng(4)
     sensors = bench(rng, 40.0, 3, 3)
