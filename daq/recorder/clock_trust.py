@@ -120,14 +120,14 @@ class ClockWatch:
         at = now.monotonic_ns * 1e-9
         ahead = (self._clock.utc_ns() - now.utc_ns) * 1e-9
         step = ahead - self._ahead if self._clock.speed == 1.0 else 0.0
-        self._ahead = ahead
         is_step = abs(step) > STEP
         if not is_step and at < self._reported + REPORT_INTERVAL:
             return None
         self._reported = at
         state = self._state()
         text = "state unknown: the system does not tell" if state is None else state.text
-        if is_step:
+        if is_step:  # in one step, or in several that are too small to be reported
+            self._ahead = ahead
             text = f"set by {step:+.3f} s; the times of this recording do not follow; {text}"
         return Event("", EventKind.CLOCK, text, now)
 
