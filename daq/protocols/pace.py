@@ -91,12 +91,16 @@ class Pace:
     def odd_rate(self) -> float | None:
         """Return the rate in Hz by which samples arrive, where no oscillator is so far off.
 
-        None where it may be the nominal one.
+        None where it may be the nominal one, or the count stepped: its rate was another lately.
         """
         if self._first is None or self._node_since < self._first[0] + _MIN_BASELINE:
             return None
         error = _SURE * self.scatter / (self._node_since - self._first[0])
-        return self._rate * (1 - self.drift) if abs(self.drift) > max(_ODD, error) else None
+        (then, late), *_, (now, later) = self._nodes
+        lately, unsure = (later - late) / (now - then), _SURE * self.scatter / (now - then)
+        is_steady = abs(lately - self.drift) <= abs(self.drift) / 2 + unsure
+        is_odd = is_steady and abs(self.drift) > max(_ODD, error)
+        return self._rate * (1 - self.drift) if is_odd else None
 
     def take(self, index: float, at: HostTime) -> None:
         """Take the arrival of a sample; samples that arrive together have that of the last one."""
