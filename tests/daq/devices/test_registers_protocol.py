@@ -215,15 +215,8 @@ def test_a_device_time_that_is_set_moves_no_instant(step: int, first: int) -> No
     )
     assert np.abs(instants / MS - 10.0 * np.arange(400) - 4.5).max() < 5
     assert [block.first_sample for block in blocks] == list(range(0, 400, 25))
-    assert sum(isinstance(item, Event) for item in found) == 1
-
-
-def test_a_device_time_that_jumps_restarts_the_clock() -> None:
-    one = decoder(rate=4.0, time_address=1, time_format="uint32-s")
-    one.receive([0, 0, 100], host(0), host(0))
-    found = one.receive([0, 0, 5000], host(250), host(250))
-    assert only(Event, found[:1]).kind == "reset"
-    assert only(Block, found[1:]).flags == BlockFlag.CLOCK_RESTART
+    assert BlockFlag.CLOCK_RESTART in blocks[8].flags
+    assert only(Event, [item for item in found if isinstance(item, Event)]).kind == "reset"
 
 
 def test_a_device_that_was_off_for_a_while_leaves_a_gap() -> None:
