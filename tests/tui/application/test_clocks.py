@@ -1,4 +1,4 @@
-"""What the application says of clocks: what is left, whether it matters, how they drift."""
+"""What the application says of a snapshot: its clocks, how far the test is, what is wrong."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from daq.bench.units import decibels
 from daq.devices.bench_file import parse
 from daq.estimation.snapshot_diagnostics import (
     SnapshotDiagnostics,
@@ -15,10 +16,26 @@ from daq.estimation.snapshot_diagnostics import (
 from daq.results.clock_effect import effect, effect_by_sensor
 from daq.results.result import Result
 from tests.tui.demo_bench import DEMO
-from tests.tui.example_snapshot import SETTINGS, empty_snapshot, made_snapshot
+from tests.tui.example_snapshot import (
+    RATE,
+    SETTINGS,
+    diagnosed,
+    empty_snapshot,
+    made_now,
+    made_snapshot,
+)
 from tui.application.test_view.clocks import clock_line, drift_lines, drift_title
+from tui.application.test_view.details import details
+from tui.application.test_view.panels import (
+    alerts,
+    noise_in_band,
+    progress_line,
+    sensor_table,
+)
 from tui.application.test_view.plot import TimeAxis
+from tui.application.test_view.plotted import Choice
 from tui.commands.demo import compare
+from tui.output.console import console
 from tui.page.blocks import Paragraph
 from tui.page.table import Table
 from tui.report.evidence import clocks_section
@@ -147,3 +164,72 @@ def test_labels_of_time_have_room_in_sixty_columns(minutes: float) -> None:
     ticks, labels = axis.get_ticks_and_labels(0.08, minutes)
     assert 2 <= len(ticks) <= 6
     assert sum(len(label) + 1 for label in labels) <= 49
+
+
+# --- panels ----------------------------------------------------------------------------------
+
+
+CHOICE = Choice(methods=("three-sensor",))
+
+
+def filled(since: dict[str, float]) -> int:
+    """Return the full cells of the bar once sensors have sent for so many seconds since."""
+    snapshot = made_snapshot(n_effective=100)
+    before = {sensor.name: sensor.n_samples for sensor in snapshot.sensors}
+    now = made_now(elapsed=100 + max(since.values()))
+    now = replace(
+        now,
+        sensors=tuple(
+            replace(s, n_samples=before[s.name] + round(RATE * since[s.name])) for s in now.sensors
+        ),
+    )
+    settings = replace(SETTINGS, target_cov=0.15)
+    return progress_line(now, Result(snapshot, settings), width=150).plain.count("━")
+
+
+def test_the_bar_goes_on_while_all_sensors_send_and_stands_while_one_is_lost() -> None:
+    fresh = filled({"A": 0, "B": 0, "C": 0})
+    assert filled({"A": 100, "B": 101, "C": 102}) > fresh > 0
+    assert filled({"A": 3600, "B": 0, "C": 3600}) == fresh
+
+
+@pytest.mark.parametrize(
+    ("reject", "said"),
+    [(None, "are excluded"), (True, "are excluded"), (False, "are kept: do not")],
+)
+def test_what_becomes_of_clipped_segments_is_as_the_settings_say(
+    reject: bool | None, said: str
+) -> None:
+    now = made_now()
+    now = replace(now, sensors=(replace(now.sensors[0], is_clipping=True),))
+    (alert,) = alerts(now, Result(made_snapshot(), replace(SETTINGS, reject=reject)))
+    assert said in alert
+
+
+def test_counts_are_grouped_alike() -> None:
+    now = made_now()
+    much = replace(now.sensors[0], n_samples=113481, n_gaps=1, n_missing=13793)
+    now = replace(now, sensors=(much, *now.sensors[1:]))
+    table = sensor_table(now, Result(made_snapshot(), SETTINGS), CHOICE, width=150)
+    screen = console()
+    with screen.capture() as said:
+        screen.print(table)
+        screen.print(details(now, None, trouble=""))
+    assert said.get().count("113\u202f481") == 1
+    assert said.get().count("13\u202f793") == 2
+
+
+@pytest.mark.parametrize(("width", "error"), [(150, "±"), (40, "")], ids=["wide", "narrow"])
+def test_names_of_channels_are_shown_whole_with_and_without_room_for_errors(
+    width: int, error: str
+) -> None:
+    snapshot = diagnosed(channels=("X-1", "Y±2", "Z"))
+    means = noise_in_band(Result(snapshot, SETTINGS), CHOICE)
+    table = sensor_table(made_now(), Result(snapshot, SETTINGS), CHOICE, width=width)
+    screen = console()
+    with screen.capture() as said:
+        screen.print(table, width=150)
+    for number, name in enumerate(("X-1", "Y±2", "Z")):
+        level = f"{decibels(float(means[number].mean[0])):.1f}".replace("-", "−")
+        assert f"{name} {level}{error}" in said.get()
+    assert said.get().count("±") == 3 + 9 * len(error)
