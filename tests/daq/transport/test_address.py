@@ -1,11 +1,14 @@
-"""Addresses of bench files that lead to ports which this computer serves."""
+"""Addresses of bench files that lead to ports of this computer; lasting names of serial ports."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from daq.transport.address import is_same_port
 from daq.transport.ports import caveats_of
+from daq.transport.serial_ports import stable_path
 
 
 @pytest.mark.parametrize(
@@ -46,3 +49,20 @@ def test_other_ports_are_not(port: str, served: str) -> None:
 def test_a_can_bus_without_an_adapter_is_simulated() -> None:
     assert caveats_of("can://vcan0")
     assert not caveats_of("can://can0")
+
+
+# --- serial ports ----------------------------------------------------------------------------
+
+
+def test_the_constant_name_of_a_port_is_found(tmp_path: Path) -> None:
+    folder, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
+    folder.mkdir()
+    device.touch()
+    (tmp_path / "ttyUSB1").touch()
+    link = folder / "usb-FTDI_FT232R_A1-if00-port0"
+    link.symlink_to("../ttyUSB0")
+    assert stable_path(str(device), folder) == str(link)
+    assert stable_path(str(link), folder) == str(link)
+    assert stable_path(str(tmp_path / "ttyUSB1"), folder) == str(tmp_path / "ttyUSB1")
+    assert stable_path("socket://host:1", folder) == "socket://host:1"
+    assert stable_path(str(device), tmp_path / "none") == str(device)
