@@ -18,7 +18,7 @@ from sim_devices.errors import ServeError
 from sim_devices.server.launch import RunningDevice
 from sim_devices.world.scenario import Scenario
 from tests.devices import device_at, host_clock, serving
-from tests.sim_devices.simulated_bench import AXES, device, scenario, sensors, spec
+from tests.sim_devices.simulated_bench import AXES, device, sensors, spec
 from tests.tcp import served
 
 pytestmark = pytest.mark.devices
@@ -174,11 +174,6 @@ def test_a_spec_that_cannot_be_served_is_refused_with_its_cause() -> None:
         serving(wrong),
     ):
         pass
-
-
-def test_the_scenario_passes_through_json() -> None:
-    table = scenario("A").to_dict()
-    assert Scenario.from_dict(table).to_dict() == table
 
 
 async def test_a_device_may_record_two_of_its_axes() -> None:

@@ -220,18 +220,3 @@ def test_repeated_and_reordered_packets_are_sorted() -> None:
     assert rows == [[i, 1000 + i, 2000 + i] for i in range(1000)]
     assert f"({n_again} so far)" in [e.text for e in events if "repeated" in e.text][-1]
     assert any("their time contradicts the others" in e.text for e in events)
-
-
-@pytest.mark.parametrize("ahead", [-1.0, -0.3, -0.02, 0.02, 0.3, 1.0, 3600.0, -3600.0])
-def test_packets_of_a_clock_that_is_set_are_all_kept(ahead: float) -> None:
-    decoder = TextDecoder("A", SHAKE, sampling_rate=100.0)
-    found: list[DeviceItem] = []
-    for packet in range(40):
-        for channel in SHAKE.channel_names:
-            sent = datacast(channel, packet, ahead=ahead * (packet >= 20))
-            found += decoder.receive_datagram(sent, at(packet / 4))
-    index, rows, events = split(found)
-    n_waiting = 50 * (ahead > 0)  # groups that are early wait for two more
-    assert len(index) >= 1000 - n_waiting
-    assert index == [row[0] for row in rows] == list(range(len(index)))
-    assert [e.kind for e in events].count("reset") == 1

@@ -25,8 +25,8 @@ def split(found: list[DeviceItem]) -> tuple[list[int], list[list[float]], list[E
     return indices(blocks), rows, events_of(found)
 
 
-def datacast(channel: str, packet: int, *, ahead: float = 0.0) -> bytes:
+def datacast(channel: str, packet: int) -> bytes:
     first = packet * 25
-    fields = [f"'{channel}'", f"{1582315130.292 + packet * 0.25 + ahead:.3f}"]
+    fields = [f"'{channel}'", f"{1582315130.292 + packet * 0.25:.3f}"]
     fields += [str(1000 * SHAKE.channel_names.index(channel) + first + i) for i in range(25)]
     return encode_fields(fields, TextFormat(delimiter=", ", prefix="{", terminator="}"))
