@@ -262,22 +262,20 @@ class _DeviceTime:
 
     def placed(
         self, times: NDArray[np.int64], before: NDArray[np.int64], received: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64] | None, bool]:
-        """Return the host times of readings, in ns, and whether the device's time jumped.
+    ) -> NDArray[np.int64] | None:
+        """Return the host times of readings, in ns; None where the device's time jumped.
 
-        None where it jumped between these readings. ``before``: when the polls before were sent.
+        ``before``: when the polls before were sent.
         """
-        of_each = before - times, received - times
-        own = int(of_each[0].max()), int(of_each[1].min())
-        leak = round(DRIFT * (int(received[-1]) - self._at))
-        lags = max(own[0], self._least - leak), min(own[1], self._largest + leak)
-        jumped = lags[0] > lags[1] + self._step
-        lags = own if jumped else lags
-        apart = lags[0] > lags[1] + self._step
-        if apart:
-            lags = int(of_each[0][-1]), int(of_each[1][-1])
-        self._least, self._largest, self._at = *lags, int(received[-1])
-        return None if apart else times + lags[1], jumped
+        at, least, largest = int(received[-1]), before - times, received - times
+        leak = round(DRIFT * (at - self._at))
+        low = max(int(least.max()), self._least - leak)
+        high = min(int(largest.min()), self._largest + leak)
+        has_jumped = low > high + self._step
+        if has_jumped:  # before the last of these readings
+            low, high = int(least[-1]), int(largest[-1])
+        self._least, self._largest, self._at = low, high, at
+        return None if has_jumped else times + high
 
 
 class RegisterDecoder:
@@ -352,9 +350,10 @@ class RegisterDecoder:
         instants = sent + (received - sent) // 2
         restarted = self._last_instant is None
         if times is not None:
-            placed, jumped = self._device_time.placed(times[new], before[new], received)
-            instants = instants if placed is None else placed
-            if jumped:
+            placed = self._device_time.placed(times[new], before[new], received)
+            if placed is not None:
+                instants = placed
+            else:
                 restarted = True
                 found.append(Event(self._sensor, EventKind.RESET, "the device's time jumped", at))
         counts = self._map.counts(registers)
