@@ -46,6 +46,8 @@ RARE, SPIKES = 0.003, 0.5
 """Share of the samples with so much of the noise that these are spikes."""
 TOGETHER = 0.92
 """Evidence of all channels of a sensor, over what it were of independent ones."""
+LASTS = 9
+"""Samples over which the power of motion is averaged, too: a rattle lasts."""
 PIECE = 24
 """Samples of a piece, of 2 to 2.5 for each wave of the highest frequency of a band."""
 MUCH, WITHIN_BAND = 0.05, 4.0
@@ -212,7 +214,12 @@ class _Sensor:
         x, slope = (course(each, everything) for each in (motion, turn * motion))
         r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
+        total = np.cumsum(squares[0], axis=2)
+        around = total[..., LASTS:] - total[..., :-LASTS]
+        lasting, of_lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
         (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
+        lasts = lasting > np.abs(gain)
+        gain, of_gain = np.where(lasts, lasting, gain), np.where(lasts, of_lasting, of_gain)
         curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
         if is_highest:
             spikes, (curve, of_curve) = _of_spikes(r), _curve(r, x)

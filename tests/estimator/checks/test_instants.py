@@ -59,14 +59,25 @@ def test_instants_that_sway_have_their_size(n_sensors: int, d: int, hertz: float
     assert found[0].size == pytest.approx(3e-5 / np.sqrt(2), rel=0.5)
 
 
-def test_a_gain_that_jitters_within_segments_has_its_size() -> None:
+@pytest.mark.parametrize(("ratio", "size"), [(45.0, 0.005), (18.0, 0.2)])
+def test_a_gain_that_jitters_within_segments_has_its_size(ratio: float, size: float) -> None:
     rng = np.random.default_rng(2)
-    sensors = bench(rng, 45.0, 3, 3)
-    sensors[2] *= 1 + 0.005 * np.sin(2 * np.pi * 1.3 * TIME)[:, None]
+    sensors = bench(rng, ratio, 3, 3)
+    sensors[2] *= 1 + size * np.sin(2 * np.pi * 1.3 * TIME)[:, None]
     found = dependences(rng, sensors)
     assert {each.channel // 3 for each in found} == {2}
     assert found[0].form == "gain"
-    assert found[0].size == pytest.approx(0.005 / np.sqrt(2), rel=0.4)
+    assert found[0].size == pytest.approx(size / np.sqrt(2), rel=0.4)
+
+
+def test_noise_that_lasts_a_little_longer_than_the_motion_is_loud_is_found() -> None:
+    """Noise 2.5 times as high for .1 s, where a channel moves by more than 2 rms."""
+    rng = np.random.default_rng(8)
+    sensors = bench(rng, 40.0, 3, 3)
+    x = sensors[0][:, 0]
+    rattles = np.convolve(np.abs(x) > 2 * x.std(), np.ones(10), "same") > 0
+    sensors[0] += 2.3 * rattles[:, None] * rng.standard_normal((N_SAMPLES, 3))
+    assert {each.channel // 3 for each in dependences(rng, sensors)} == {0}
 
 
 def test_a_product_of_two_axes_is_in_its_channel() -> None:
