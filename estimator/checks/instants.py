@@ -35,8 +35,8 @@ WIDTH = 4.0
 LEAST_BINS = 26
 """Least frequencies of a band."""
 NOT_WEAK, VERY_LOUD = 4.0, 1000.0
-"""Power of what others predict of a channel over what they do not, from which it is compared; and
-for curves and products: noise in what is predicted bends it beside weak motion."""
+"""Power of what others predict of a channel over what they do not, in a band, from which it is
+compared; and for curves and products: noise in what is predicted bends it beside weak motion."""
 CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
 PART = 0.4
@@ -203,8 +203,7 @@ class _Sensor:
         """
         felt, left = (np.mean(np.abs(e) ** 2, axis=1) for e in (self.motion, self.rest))
         there = left[:, own].sum(axis=1) / np.maximum(felt[:, own].sum(axis=1), _LEAST)
-        noise = np.mean(left[:, own] / np.maximum(felt[:, own], _LEAST), axis=1)
-        tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (noise < 1 / NOT_WEAK))
+        tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (there < 1 / NOT_WEAK))
         if not len(tested):
             return
         turn = (2j * np.pi * self.frequency).astype(np.complex64)
@@ -226,7 +225,7 @@ class _Sensor:
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
             by_product, of_product = max(found, key=lambda each: each[0].max())
-            curve, by_product = np.where(noise[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
+            curve, by_product = np.where(there[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
         # all channels of a sensor are sampled at one instant; their residuals are not independent
         instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
         forms: tuple[Form, ...] = ("gain", "instants", "product", "curve", "spikes")

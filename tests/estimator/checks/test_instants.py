@@ -118,6 +118,18 @@ def test_a_channel_that_is_too_slow_for_most_of_its_motion_is_found(most: float)
     assert {each.channel for each in dependences(rng, sensors)} == {3}
 
 
+def test_play_beside_red_motion_is_found() -> None:
+    """Its noise is above the motion at most frequencies, and far below all of the motion."""
+    rng = np.random.default_rng(17)
+    frequency = np.maximum(np.fft.rfftfreq(N_SAMPLES, 1 / RATE), 0.05)[:, None]
+    sensors = [
+        np.fft.irfft(np.fft.rfft(each, axis=0) * (frequency / 5) ** -1.5, axis=0)
+        for each in bench(rng, 50.0, 3, 3)
+    ]
+    sensors[1][:, 0] = with_play(sensors[1][:, 0], 0.05 * float(sensors[1][:, 0].std()))
+    assert {each.channel for each in dependences(rng, sensors)} == {3}
+
+
 def test_short_gaps_that_are_filled_are_spikes_or_noise_where_motion_is_slow() -> None:
     rng = np.random.default_rng(4)
     sensors = bench(rng, 40.0, 3, 3)
