@@ -320,7 +320,6 @@ class StretchPass(Pass):
     def restart(self) -> None:
         """Begin again, with the clocks as they are now."""
         super().restart()
-        self.single = None  # single segments are not kept
         self.drain(last=False)
         self._writer.restart()
         self._number: int | None = None

@@ -328,8 +328,6 @@ class Estimation:
             each.aligned.refresh()
             if each.n_seen and not each.aligned.is_exact:
                 self._passes[number] = self._pass(each.recording, self._passes[:number])
-            if not self._passes[number].shows_drifts:
-                self._passes[number].doubt_stated_times()
         recording_set.check_span(self._passes, self.settings)
         total = sum(each.n_complete for each in self._passes)
         done = self.n_seen
@@ -345,8 +343,7 @@ class Estimation:
             total += n
 
         bands = self._take_all(count, repeat)
-        doubted = [each for each in self._passes if each.shows_drifts]
-        if any([each.doubt_stated_times() for each in doubted]):  # noqa: C419 - of all of them
+        if any([each.doubt_stated_times() for each in self._passes]):  # noqa: C419 - of all of them
             repeat(done - self.n_seen)
             self._equalisation.reset()
             bands = self._take_all(count, repeat)

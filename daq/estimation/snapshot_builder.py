@@ -84,9 +84,8 @@ from estimator.spectra.segment_rejection import Reason
 from estimator.spectra.welch import SegmentSpectra, kept_rows
 
 
-def keep_few(spectra: Sequence[SegmentSpectra | None]) -> None:
+def keep_few(kept: Sequence[SegmentSpectra]) -> None:
     """Keep no more segments of all recordings together than of a single one."""
-    kept = [each for each in spectra if each is not None]
     every = max((single.every for single in kept), default=1)
     while len(kept) > 1:
         for single in kept:
@@ -105,10 +104,10 @@ def segment_course(
     segments is taken out, as from the averages.
     """
     spectra, times, runs = [], [], []
-    every = max((each.single.every for each in passes if each.single is not None), default=1)
+    every = max(each.single.every for each in passes)
     origin = passes[0].aligned.start_utc_ns
     for run, each in enumerate(passes):
-        if each.single is None or each.n_bridged:
+        if each.n_bridged:
             return None
         some = kept_rows(len(each.single), every // each.single.every)
         some = some[np.argsort(each.kept_at[some])]  # those held back are taken late
@@ -118,7 +117,7 @@ def segment_course(
         times.append(later + at / each.welch.sampling_rate)
         runs.append(np.full(len(found), run))
     first = passes[0]
-    if first.single is None or not sum(map(len, spectra)):
+    if not sum(map(len, spectra)):
         return None
     bins = first.single.bins
     response = responses(first.welch.frequencies[bins], channels, unit)

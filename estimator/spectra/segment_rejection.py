@@ -162,13 +162,7 @@ class SelectedSpectra:
         self._since_renewal = 0
         self._in_a_row = 0
 
-    def add(
-        self,
-        samples: FloatArray,
-        starts: IntArray,
-        *,
-        places: IntArray | None = None,
-    ) -> None:
+    def add(self, samples: FloatArray, starts: IntArray, *, places: IntArray | None = None) -> None:
         """Test the segments of `samples` that begin at `starts`, and add the accepted ones.
 
         Parameters

@@ -206,10 +206,7 @@ class CrossSpectra:
             self._add(spectra, places, products)
 
     def _add(
-        self,
-        spectra: ComplexArray,
-        places: IntArray | None,
-        products: FloatArray | None = None,
+        self, spectra: ComplexArray, places: IntArray | None, products: FloatArray | None = None
     ) -> None:
         self._products.add(spectra, products)
         if self.segments is not None:

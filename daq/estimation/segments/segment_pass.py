@@ -244,7 +244,7 @@ class Pass:
         self.octaves: MultiResolution | None = None
         self._undisturbed: SelectedSpectra | None = None
         kept = kept_bins(len(self.welch.frequencies))
-        self.single: SegmentSpectra | None = SegmentSpectra(kept, self.n_channels)
+        self.single = SegmentSpectra(kept, self.n_channels)
         if wanted.octaves:
             self.octaves = MultiResolution(
                 self.welch,
@@ -380,8 +380,7 @@ class Pass:
     @property
     def kept_at(self) -> NDArray[np.int64]:
         """Grid samples at which the segments of `single` begin."""
-        places = np.empty(0, np.int64) if self.single is None else self.single.places
-        return self.reach + places * self.welch.hop
+        return self.reach + self.single.places * self.welch.hop
 
     @property
     def n_complete(self) -> int:
@@ -477,14 +476,13 @@ class Pass:
         One process sums the same pieces in the same order: results are equal to the bit.
         """
         n_segments = max(count for _, count in pieces)
-        n_bins = 0 if self.single is None else len(self.single.bins)
         n_freqs, n_picked = len(self.welch.frequencies), n_segments // self._every + 2
         n_picked = n_picked if self._delays.measures else 0
 
         def room() -> _Sums:
             return _Sums(
                 forked.shared(self._all.products_shape, np.float64),
-                forked.shared((n_segments, n_bins, self.n_channels), np.complex64),
+                forked.shared((n_segments, len(self.single.bins), self.n_channels), np.complex64),
                 forked.shared((n_picked, n_freqs, self.n_channels), np.complex128),
                 forked.shared(self.stillness.counts.shape, np.int64),
             )
@@ -519,7 +517,7 @@ class Pass:
             kept = part.raw_kept
             is_whole = part.unwanted is None and bool(part.usable.all())
             is_whole &= not self._delays.measures
-        if not is_whole or self.single is None:
+        if not is_whole:
             return False
         stillness = FlatlineDetector(hop, self.n_channels, self.welch.sampling_rate)
         stillness.add(part.raw, kept)
@@ -673,7 +671,7 @@ class Pass:
 
     def _departs(self) -> bool:
         """Return whether any segment is off the clocks, though delays are measured in few only."""
-        if self._every == 1 or self.single is None or not len(self.single):
+        if self._every == 1 or not len(self.single):
             return False
         suspects = self._delays.suspects(self.single)
         if suspects is None or len(suspects) > _SOME_SUSPECTS + _MOST_SUSPECTS * self.n_seen:
@@ -949,15 +947,10 @@ class Pass:
             self._delays.learn_held()
             self.aligned.set_clocks(slips=slips)
 
-    @property
-    def shows_drifts(self) -> bool:
-        """Whether the segments, once taken, can show that no stated UTC drifts."""
-        return self.single is not None
-
     def doubt_stated_times(self) -> bool:
         """Return whether stated UTC was found to drift only now; then all begins again."""
         sensors = self.aligned.stated
-        if len(sensors) > 1 and self.single is not None and self._settings.clocks == "refined":
+        if len(sensors) > 1 and self._settings.clocks == "refined":
             window = get_window(self.welch.window, self.welch.segment_length)
             n_effective = effective_averages(window, self.welch.hop, max(self.n_segments, 1))
             if agree(self.aligned, self.single, self.kept_at, self.welch, n_effective=n_effective):
