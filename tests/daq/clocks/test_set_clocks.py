@@ -212,7 +212,7 @@ def stating(path: Path, faults: dict[str, tuple[str, float]], *, seconds: float 
     [
         {"B": ("gap", 2.0)},
         {"B": ("loss", 0.5)},
-        {"C": ("gap", 20.0)},
+        pytest.param({"C": ("gap", 20.0)}, marks=pytest.mark.long),
         pytest.param({"A": ("gap", 0.3), "C": ("loss", 2.0)}, marks=pytest.mark.long),
         pytest.param({"B": ("gap", 0.02)}, marks=pytest.mark.long),
         pytest.param({"B": ("loss", 0.01)}, marks=pytest.mark.long),

@@ -86,6 +86,7 @@ def test_noise_that_changes_is_no_gradient_of_the_motion() -> None:
         assert held(snapshot, noise).mean() >= 0.93
 
 
+@pytest.mark.long
 def test_noise_that_two_channels_share_is_in_their_intervals() -> None:
     """It is no further dimension of the motion, and the one channel predicts it of the other."""
     rng = np.random.default_rng(1)
