@@ -1,7 +1,7 @@
 """Whether what others do not predict of a channel depends on its motion at the same instant.
 
 Own noise knows nothing of the motion. What a hysteresis, the steps of a converter or a limited
-speed leave has a mean that is a curve of the motion. What instants of samples that vary leave is
+speed leave has a mean that is a curve of the motion, or of its steps. What instants of samples that vary leave is
 ``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast or seldom: their
 mean is 0, but their square follows that of the slope or of the motion, instant by instant, where
 averages of segments show noise.
@@ -221,7 +221,9 @@ class _Sensor:
         gain, of_gain = np.where(lasts, lasting, gain), np.where(lasts, of_lasting, of_gain)
         curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
         if is_highest:
-            spikes, (curve, of_curve) = _of_spikes(r), _curve(r, x)
+            steps = np.diff(x, axis=2)  # play follows their sign
+            curves = _curve(r, x), _curve(r[..., 1:], steps)
+            spikes, (curve, of_curve) = _of_spikes(r), max(curves, key=lambda e: e[0].max())
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
             by_product, of_product = max(found, key=lambda each: each[0].max())
