@@ -1,10 +1,10 @@
 """Whether what others do not predict of a channel depends on its motion at the same instant.
 
 Own noise knows nothing of the motion. What a hysteresis, the steps of a converter or a limited
-speed leave has a mean that is a curve of the motion, or of its steps. What instants of samples that vary leave is
-``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast or seldom: their
-mean is 0, but their square follows that of the slope or of the motion, instant by instant, where
-averages of segments show noise.
+speed leave has a mean that is a curve of the motion, or of its steps. What instants of samples that
+vary leave is ``tau(t) x'(t)``, what a gain that varies leaves is ``g(t) x(t)``, however fast or
+seldom: their mean is 0, but their square follows that of the slope or of the motion, instant by
+instant, where averages of segments show noise.
 
 Residuals are those of spectra of segments, with unit power at all frequencies up to an end. These
 tests compare segments with each other, so that no distribution of the noise is assumed. Evidence
