@@ -47,7 +47,8 @@ FEW_AVERAGES = 20.0
 MUCH_MOTION = 10.0
 """Motion over noise from which changes of a response count."""
 SELDOM = 0.05
-"""Share of segments up to which these are disturbed, more than three: else the noise is loud."""
+"""Share of segments up to which these are disturbed, more than three: else the noise is loud, but
+where these have most of it."""
 DISTURBED = 2.0
 """Share of the noise that disturbed segments may be, over that which their residuals show."""
 MOST_SHARED = 0.99
@@ -152,7 +153,7 @@ def _by_disturbed(snapshot: Snapshot) -> FloatArray:
     share = DISTURBED * (1 - 1 / (1 + np.maximum(more, 0.0)))
     most = np.where(more > LARGE, math.inf, np.where(more > SMALL, share, 0.0))
     is_seldom = len(steady.disturbed) <= max(3, SELDOM * steady.n_segments)
-    return np.where(is_seldom | np.isinf(more), most, 0.0)
+    return np.where(is_seldom | (more > 1), most, 0.0)
 
 
 def _faulty(snapshot: Snapshot, psd: FloatArray, by_disturbed: FloatArray) -> Contribution:

@@ -75,6 +75,19 @@ def test_motion_that_the_test_of_fewer_dimensions_hides_is_in_the_interval(snr: 
     assert held(snapshot, noise).mean() >= 0.95
 
 
+def test_a_square_of_bursts_has_no_lower_end() -> None:
+    """Bursts are too many to be disturbances, and too few to show a square."""
+    rng = np.random.default_rng(16)
+    noise, motion = white(rng, 3), felt(rng, 3, 1e4)
+    for first in np.linspace(500, N_SAMPLES - 1500, 4).astype(int):
+        for each in motion:
+            each[first : first + 600] *= 30
+    motion[0][:, 1] += 2e-3 * motion[0][:, 1] ** 2 / motion[0][:, 1].std()
+    inside = held(estimated(motion, noise), noise)
+    assert inside[:, 1].all()
+    assert inside.mean() > 0.9
+
+
 def test_noise_that_changes_is_no_gradient_of_the_motion() -> None:
     """Positions fitted to it would hold one sensor alone, and take its noise for motion."""
     for seed in range(2):
