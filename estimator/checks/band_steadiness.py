@@ -420,10 +420,12 @@ def band_steadiness(
     by_run: Sequence[IntArray],
     correlation: FloatArray,
     dims: tuple[int, ...],
+    burstiness: float,
 ) -> list[BandSteadiness | None]:
     """Return what the parts show of each band, at some of its frequencies.
 
     None where that is too little. Weak motion shows no response; its fit is of one frequency.
+    Leakage is coherent with the motion as far as `SegmentCourse.burstiness` says.
     """
     n_values, q = sum(dims) ** 2, max(1, maximum.n_factors)
     sensor_of = np.repeat(np.arange(len(dims)), dims) if is_weak else None
@@ -463,7 +465,9 @@ def band_steadiness(
             "leaked": np.zeros_like(beside),
             "projectors": some.sums(np.abs(found.projector) ** 2),
         }
-        slopes = np.zeros_like(found.directions) if is_weak else slopes_of(maximum, bins, psd)
+        slopes = np.zeros_like(found.directions)
+        if not is_weak:
+            slopes = math.sqrt(burstiness) * slopes_of(maximum, bins, psd)
         if used.any():
             sums["power"] = some.of_parts(found.explained(np.repeat(used.T, some.sizes, axis=1)))
             sums["leaked"] = some.sums(found.leaked(slopes))

@@ -5,6 +5,8 @@ A segment is disturbed if its residual beside the motion stands out.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -53,6 +55,23 @@ class SegmentCourse:
     times: FloatArray
     runs: IntArray
     findings: SegmentFindings | None = None
+
+    @property
+    def burstiness(self) -> float:
+        """Variance of the power over its square that is alike at other frequencies, up to 1.
+
+        Zero but for scatter where motion is steady: noise of segments differs by frequency.
+        """
+        n_bins = self.spectra.shape[1]
+        if len(self.spectra) < 2 or n_bins < 2:
+            return 1.0
+        course = []
+        for some in np.array_split(np.arange(n_bins), max(2, n_bins // FREQUENCIES)):
+            power = np.abs(self.spectra[:, some]) ** 2
+            usual = power.mean(axis=0)
+            course.append((power / np.where(usual > 0, usual, 1.0)).mean(axis=(1, 2)) - 1)
+        found = max(float(np.mean(one * other)) for one, other in itertools.pairwise(course))
+        return min(max(found, 0.0), 1.0) if math.isfinite(found) else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +145,7 @@ def segment_findings(
     own = np.einsum("fpp->fp", residuals.projector).real
     leaks = slopes_of(maximum, course.bins[there], psd) * at.eigenvalues[:, None]
     leaks = leaks @ at.eigenvectors.conj().swapaxes(1, 2)
+    leaks *= math.sqrt(course.burstiness)
     motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)
     gains = SegmentGains(own, course.bins[there], groups, dims, leaks=leaks, power=motion)
     powers, felt = [], []

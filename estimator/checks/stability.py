@@ -381,6 +381,7 @@ def stability(
         by_run=by_run,
         correlation=np.concatenate([[1.0], neighbours, [0.0]]),
         dims=dims,
+        burstiness=1.0 if course is None else course.burstiness,
     )
     some, whole = ([e[inside[parts.bins[e]]] for inside in insides] for e in (places, every))
     is_weak = [not doubtful and is_weak_motion(maximum.take(parts.bins[each])) for each in whole]
