@@ -470,7 +470,7 @@ def _counts(
         return by is next(of_it, None)
     if isinstance(advice, DisturbedSegments):
         return by is next(e for e in reversed(found) if e.stability is not None)
-    return by is clearest or not advice.sensors or isinstance(advice, NoiseChanges)
+    return by is clearest or not advice.sensors or isinstance(advice, NoiseChanges | SharedNoise)
 
 
 def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:

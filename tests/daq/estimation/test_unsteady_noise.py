@@ -245,3 +245,18 @@ def test_gusts_are_no_motion_and_bound_no_level() -> None:
     kinds = [type(each) for each in snapshot.diagnostics.advice]
     assert NoiseChanges in kinds
     assert DisturbedSegments not in kinds
+
+
+def test_noise_that_sensors_share_opens_every_octave() -> None:
+    """Only the octave of the clearest motion counted: below it, noise was up to 1.3 times off."""
+    rng = np.random.default_rng([2, 3])
+    samples = turned(rng, 100 * rng.standard_normal((24000, 3)))
+    shared = np.sqrt(0.5) * rng.standard_normal(24000)
+    for each in samples.values():
+        each[:, 0] += shared
+    snapshot = huddle.self_noise(samples, fs=20.0, segment="5s", octaves=True).snapshot
+    result = Result(snapshot, Settings())
+    for band in ((0.5, 2.0), (2.0, 4.0), (5.0, 9.0)):
+        for mean in result.means(result.method, band)[::3]:
+            assert mean.low[0] <= 0.01
+            assert mean.high[0] >= 0.15
