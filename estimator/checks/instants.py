@@ -39,6 +39,9 @@ NOT_WEAK, VERY_LOUD = 4.0, 1000.0
 compared; and for curves and products: noise in what is predicted bends it beside weak motion."""
 CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
+BURSTS = 0.7
+"""By which evidence of play counts less: what leaks at the edges of bursts looks a little like it.
+"""
 PART = 0.4
 """Power that depends on the motion, over the most of any channel, from which a channel is named:
 a third sensor has a quarter of it in what others leave of it."""
@@ -222,7 +225,8 @@ class _Sensor:
         curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
         if is_highest:
             steps = np.diff(x, axis=2)  # play follows their sign
-            curves = _curve(r, x), _curve(r[..., 1:], steps)
+            by_steps, of_steps = _curve(_beside(r[..., 1:], steps), steps)
+            curves = _curve(r, x), (BURSTS * by_steps, of_steps)
             spikes, (curve, of_curve) = _of_spikes(r), max(curves, key=lambda e: e[0].max())
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
@@ -295,9 +299,14 @@ def _left(r: Samples, motion: Samples, *edges: Samples) -> Samples:
     along = np.einsum("acst,cst->ca", edges, r)
     much = (np.linalg.pinv(gram, hermitian=True) @ along[..., None])[..., 0]
     r = r - np.einsum("acst,ca->cst", edges, much)
-    size = np.einsum("cst,cst->cs", motion, motion)
-    common = np.einsum("cst,cst->cs", r, motion) / np.maximum(size, _LEAST)
-    return np.asarray(r - common[..., None] * motion)
+    return _beside(r, motion)
+
+
+def _beside(r: Samples, x: Samples) -> Samples:
+    """Return what x leaves of r in each segment."""
+    size = np.einsum("cst,cst->cs", x, x)
+    common = np.einsum("cst,cst->cs", r, x) / np.maximum(size, _LEAST)
+    return np.asarray(r - common[..., None] * x)
 
 
 def _evidence(along: FloatArray) -> FloatArray:
