@@ -9,13 +9,10 @@ few frequencies: they show changes with time.
 
 from __future__ import annotations
 
-import io
-import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import cache
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -373,51 +370,6 @@ class CrossSpectra:
         total.merge(other)
         return total
 
-    def to_bytes(self) -> bytes:
-        """Return the accumulator as a NumPy ``.npz`` archive, for another process or machine."""
-        content = io.BytesIO()
-        np.savez(
-            content,
-            settings=np.array(json.dumps(asdict(self.settings))),
-            n_segments=np.array(self.n_segments),
-            sum=self._products.total(),
-        )
-        return content.getvalue()
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> Self:
-        """Return the accumulator from `to_bytes`.
-
-        Raises
-        ------
-        EstimatorError
-            If `content` is invalid.
-        """
-        import zipfile  # noqa: PLC0415 - only of parts of an estimate
-
-        try:
-            with zipfile.ZipFile(io.BytesIO(content)) as packed:
-                is_packed = {each.compress_type for each in packed.infolist()} != {
-                    zipfile.ZIP_STORED
-                }
-            if is_packed:  # it could become a thousand times as much
-                raise EstimatorError("not a serialised cross-spectral matrix: compressed")
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                fields = json.loads(str(archive["settings"]))
-                if isinstance(fields["window"], list):  # JSON has no tuples
-                    fields["window"] = tuple(fields["window"])
-                settings = WelchSettings(**fields)
-                total = archive["sum"]
-                n_segments = int(archive["n_segments"])
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise EstimatorError(f"not a serialised cross-spectral matrix: {error}") from error
-        spectra = cls(settings, total.shape[-1])
-        if total.shape != (*spectra._shape, total.shape[-1]) or n_segments < 0:
-            raise EstimatorError(f"not a serialised cross-spectral matrix: shape {total.shape}")
-        spectra._products.add_total(total)
-        spectra.n_segments = n_segments
-        return spectra
-
 
 class _Work:
     """Tapered segments and spectra of one group: memory that is not taken afresh for each."""
@@ -528,10 +480,6 @@ class _Products:
         self._settle()
         other._settle()
         self._total += other._total
-
-    def add_total(self, total: ComplexArray) -> None:
-        """Add what `total` returned."""
-        self._total += packed(total)
 
 
 def _add_gram(total: FloatArray, gram: FloatArray) -> None:

@@ -20,8 +20,6 @@ from daq.recording.storage.journal import journal_path, read_journal
 from daq.recording.storage.packing import PIPELINE, InflationError
 from daq.recording.storage.refusals import check_all, dataset, hdf5_function, member
 from daq.recording.storage.whole_hdf5 import contents_sha256
-from estimator.errors import EstimatorError
-from estimator.spectra.welch import CrossSpectra
 from tests.traced_memory import peak_of
 
 MAGIC = b"huddle-journal 1\n"
@@ -157,10 +155,3 @@ def test_names_of_groups_are_not_packed(tmp_path: Path) -> None:
             member(file, "results")
         with pytest.raises(NotARecordingError, match="its names are packed"):
             check_all(file)
-
-
-def test_sums_of_another_computer_are_not_packed() -> None:
-    packed = io.BytesIO()
-    np.savez_compressed(packed, settings="{}", n_segments=1, sum=np.zeros((1 << 20, 3)))
-    with pytest.raises(EstimatorError, match="compressed"):
-        CrossSpectra.from_bytes(packed.getvalue())
