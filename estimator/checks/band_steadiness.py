@@ -69,6 +69,10 @@ CONFIRMED = 0.5
 LEAST_DEGREES = 8.0
 """Degrees of freedom of the noise of a part from which a band is tested."""
 
+UNKNOWN = 5.0
+"""Variance of scores over that of steady noise, where averages are too few to tell: that of noise
+which is twenty times as loud for a tenth of the time."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Explained:
@@ -527,18 +531,19 @@ def _of_band(
         sums["squares"],
         float(sums["n_products"]),
     )
-    more = scores.inflation(whole) if known else 1.0 if is_strong else np.inf
+    more = scores.inflation(whole) if known else 1.0 if is_strong else UNKNOWN
     total, q, noise = parts.averages.sum(), max(1, n_factors), sums["noise"]
     power = sums["power"].sum(axis=0) / total / n_freqs
-    scatter = more * q * noise.sum(axis=0) / total / n_freqs
+    scatter = q * noise.sum(axis=0) / total / n_freqs
+    least = more * scatter if known else scatter
     n_alike = noise.sum(axis=0) ** 2 / np.maximum((noise**2).sum(axis=0), np.finfo(np.float64).tiny)
     return BandSteadiness(
         _Explained(
             power=power,
-            scatter=scatter,
+            scatter=more * scatter,
             leaked=sums["leaked"] / n_freqs,
             beside=sums["beside"] / n_freqs,
-            added=n_freqs * fisher.covariance(sums["projectors"][None])[0] @ (power - scatter),
+            added=n_freqs * fisher.covariance(sums["projectors"][None])[0] @ (power - least),
             degrees=2 * n_freqs**2 / float(sums["spread"]) * float(n_alike.min()) * q,
             left=total / len(left) / q - 1,
         ),

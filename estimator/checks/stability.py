@@ -295,9 +295,9 @@ class Stability:
 def _in_all_bands(
     explained: FloatArray, changes: Sequence[ResponseChange], dims: tuple[int, ...]
 ) -> FloatArray:
-    """Return what changes explain; a change of all frequencies is in bands that do not show it."""
+    """Return what changes explain, also in bands whose few averages do not show it."""
     sensor = np.repeat(np.arange(len(dims)), dims)
-    moved = np.isin(sensor, [each.sensor for each in changes if each.band is None])
+    moved = np.isin(sensor, [each.sensor for each in changes])
     return np.where(moved & (explained == 0), explained.max(axis=0), explained)
 
 
