@@ -424,6 +424,7 @@ def band_steadiness(
     by_run: Sequence[IntArray],
     correlation: FloatArray,
     dims: tuple[int, ...],
+    frequency: FloatArray,
     burstiness: float,
 ) -> list[BandSteadiness | None]:
     """Return what the parts show of each band, at some of its frequencies.
@@ -471,7 +472,7 @@ def band_steadiness(
         }
         slopes = np.zeros_like(found.directions)
         if not is_weak:
-            slopes = math.sqrt(burstiness) * slopes_of(maximum, bins, psd)
+            slopes = math.sqrt(burstiness) * slopes_of(maximum, bins, psd, frequency)
         if used.any():
             sums["power"] = some.of_parts(found.explained(np.repeat(used.T, some.sizes, axis=1)))
             sums["leaked"] = some.sums(found.leaked(slopes))

@@ -69,9 +69,12 @@ class SegmentCourse:
         for some in np.array_split(np.arange(n_bins), max(2, n_bins // FREQUENCIES)):
             power = np.abs(self.spectra[:, some]) ** 2
             usual = power.mean(axis=0)
-            course.append((power / np.where(usual > 0, usual, 1.0)).mean(axis=(1, 2)) - 1)
-        found = max(float(np.mean(one * other)) for one, other in itertools.pairwise(course))
-        return min(max(found, 0.0), 1.0) if math.isfinite(found) else 1.0
+            known = np.isfinite(usual) & (usual > 0)
+            if known.any():
+                course.append((power[:, known] / usual[known]).mean(axis=1) - 1)
+        pairs = [float(np.mean(one * other)) for one, other in itertools.pairwise(course)]
+        found = max(pairs, default=1.0)
+        return min(max(found, 0.0), 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +119,7 @@ def segment_findings(
     *,
     begin: FloatArray,
     psd: FloatArray,
+    frequency: FloatArray,
 ) -> SegmentFindings:
     """Return what segments show at `good` frequencies, shape (n_freqs,), of this `psd`.
 
@@ -143,7 +147,7 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    leaks = slopes_of(maximum, course.bins[there], psd) * at.eigenvalues[:, None]
+    leaks = slopes_of(maximum, course.bins[there], psd, frequency) * at.eigenvalues[:, None]
     leaks = leaks @ at.eigenvectors.conj().swapaxes(1, 2)
     leaks *= math.sqrt(course.burstiness)
     motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)

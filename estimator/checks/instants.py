@@ -216,18 +216,19 @@ class _Sensor:
         x, slope = (course(each, everything) for each in (motion, turn * motion))
         r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
-        total = np.cumsum(squares[0], axis=2)
-        around = total[..., LASTS:] - total[..., :-LASTS]
-        lasting, of_lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
         (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
-        lasts = lasting > np.abs(gain)
-        gain, of_gain = np.where(lasts, lasting, gain), np.where(lasts, of_lasting, of_gain)
+        if r.shape[2] >= PIECE + LASTS:
+            total = np.cumsum(squares[0], axis=2)
+            around = total[..., LASTS:] - total[..., :-LASTS]
+            lasting, of_lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
+            lasts = lasting > np.abs(gain)
+            gain, of_gain = np.where(lasts, [lasting, of_lasting], [gain, of_gain])
         curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
         if is_highest:
             steps = np.diff(x, axis=2)  # play follows their sign
             by_steps, of_steps = _curve(_beside(r[..., 1:], steps), steps)
-            curves = _curve(r, x), (BURSTS * by_steps, of_steps)
-            spikes, (curve, of_curve) = _of_spikes(r), max(curves, key=lambda e: e[0].max())
+            spikes, by_value, stepwise = _of_spikes(r), _curve(r, x), (BURSTS * by_steps, of_steps)
+            curve, of_curve = np.where(stepwise[0] > by_value[0], stepwise, by_value)
             pairs = itertools.combinations(x, 2)
             found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
             by_product, of_product = max(found, key=lambda each: each[0].max())

@@ -205,11 +205,16 @@ class Stability:
         alarm = FALSE_ALARM / (LONG_TAILS * n_sensors * len(found))
         seen = Counter(change.sensor for each in found for change in each.changes)
         clearest: dict[int, ResponseChange] = {}
-        unsteady = {gain.sensor for each in found if each.single for gain in each.single.gains}
+        unsteady = {
+            (gain.sensor, each.single.band)
+            for each in found
+            if each.single
+            for gain in each.single.gains
+        }
         is_added, second_order = False, 0.0
         for each in sorted((c for one in found for c in one.changes), key=lambda c: -c.statistic):
             most = critical_value(each.degrees, alarm) + second_order
-            if each.sensor in unsteady:  # single segments are tested once
+            if (each.sensor, each.band) in unsteady:  # single segments are tested once
                 most = 0.0
             if each.sensor in clearest or each.statistic <= most:
                 continue
@@ -381,6 +386,7 @@ def stability(
         by_run=by_run,
         correlation=np.concatenate([[1.0], neighbours, [0.0]]),
         dims=dims,
+        frequency=frequency,
         burstiness=1.0 if course is None else course.burstiness,
     )
     some, whole = ([e[inside[parts.bins[e]]] for inside in insides] for e in (places, every))
@@ -412,7 +418,7 @@ def stability(
             dims=dims,
             time=(begin, end),
         )
-    single = _of_segments(course, maximum, good, dims, begin=begin, psd=psd)
+    single = _of_segments(course, maximum, good, dims, begin=begin, psd=psd, frequency=frequency)
     if course is not None and course.findings is None:
         span, time = (float(low[0]), float(high[-1])), (float(begin[0]), float(end[-1]))
         single = replace(single, band=span, time=time)

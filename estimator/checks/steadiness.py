@@ -161,21 +161,24 @@ def whitening(at: Maximum, psd: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((np.einsum("fpp->fp", at.rest).real + share) / psd))
 
 
-def slopes_of(maximum: Maximum, bins: IntArray, psd: FloatArray) -> ComplexArray:
+def slopes_of(
+    maximum: Maximum, bins: IntArray, psd: FloatArray, frequency: FloatArray
+) -> ComplexArray:
     """Return slopes of responses per bin, as coefficients of a `Regression`; 0 where not known.
 
-    `maximum` and `psd` are those of all frequencies.
+    `maximum` and `psd` are those of all frequencies, neighbours of which may lie bins apart.
     """
     here, ends = maximum.take(bins), []
     U, P, scale = here.eigenvectors, here.projector, whitening(here, psd[bins])
     known = maximum.converged & ~maximum.singular & (psd > 0).all(axis=1)
-    for step in (-1, 1):
-        near = np.clip(bins + step, 0, len(psd) - 1)
-        near = np.where(known[near], near, bins)
+    beside = [np.clip(bins + step, 0, len(psd) - 1) for step in (-1, 1)]
+    beside = [np.where(known[near], near, bins) for near in beside]
+    for near in beside:
         at = maximum.take(near)
         V = (scale / whitening(at, psd[near]))[:, :, None] * at.eigenvectors
         ends.append(P @ V @ np.linalg.inv(U.conj().swapaxes(1, 2) @ V))
-    return np.asarray((ends[1] - ends[0]) / 2)
+    apart = (frequency[beside[1]] - frequency[beside[0]]) / np.diff(frequency).min()
+    return np.asarray((ends[1] - ends[0]) / np.maximum(apart, 1.0)[:, None, None])
 
 
 def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:

@@ -19,7 +19,7 @@ from estimator.checks.shared_motion import (
 )
 from estimator.checks.stability import Scatter, Stability
 from estimator.checks.steadied import Steadied
-from estimator.checks.steadiness import ResponseChange
+from estimator.checks.steadiness import ResponseChange, slopes_of
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
 from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
@@ -132,7 +132,10 @@ def test_disturbed_segments_are_named() -> None:
 def findings(course: SegmentCourse, csm: ComplexArray, good: BoolArray) -> SegmentFindings:
     """Return what segments of three channels in the same motion show."""
     psd = np.einsum("fpp->fp", csm).real
-    return segment_findings(course, maximise(csm, 1), good, (1, 1, 1), begin=np.zeros(1), psd=psd)
+    frequency = np.arange(float(len(csm)))
+    return segment_findings(
+        course, maximise(csm, 1), good, (1, 1, 1), begin=np.zeros(1), psd=psd, frequency=frequency
+    )
 
 
 def test_frequencies_whose_noise_is_in_doubt_show_no_disturbed_segments() -> None:
@@ -306,3 +309,19 @@ def test_a_range_of_octaves_that_is_not_steadied_keeps_what_its_changes_explain(
     share, is_within = both.changed_at(np.array([0.5, 5.0]))
     np.testing.assert_array_equal(share, [[5.0, 0.0], [0.02, 0.0]])
     np.testing.assert_array_equal(is_within, [[False, False], [True, True]])
+
+
+def test_slopes_of_responses_are_per_bin_however_far_frequencies_lie_apart() -> None:
+    rng = np.random.default_rng(2)
+    frequency = np.concatenate([[0.0], 1.0 + 8 * np.arange(40)])
+    noise, motion = rng.standard_normal((2, 4000, 3, 2)) @ [1, 1j]
+    late = np.exp(-1e-3j * frequency)
+    csm = []
+    for each in late:
+        x = noise + 10 * motion[:, :1] * np.array([1, each, 1])
+        csm.append(x.T @ x.conj() / len(x))
+    matrices = np.stack(csm)
+    maximum, psd = maximise(matrices, 1), np.einsum("fpp->fp", matrices).real
+    slopes = slopes_of(maximum, np.arange(10, 30), psd, frequency)
+    whole = np.abs(slopes[:, 1, 0] / maximum.eigenvectors[10:30, 1, 0])
+    assert np.median(whole) == pytest.approx(1e-3 * 2 / 3, rel=0.3)
