@@ -11,7 +11,7 @@ import numpy as np
 
 from daq.clocks.clock_model import RelativeTime
 from daq.errors import WrongSettingError
-from daq.results.band_summary import correlation_of
+from daq.results.band_summary import correlation_of, data_means
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, Component, calibrated_budgets, known
 from estimator.checks.shared_motion import CanonicalCoherence
@@ -332,8 +332,9 @@ class _Work:
         edges = band_edges(snapshot.frequency, band)
         levels = estimate.spectrum(estimate.method).levels(edges)
         high = levels.ends(factor=False)[1][0]
-        level = np.clip(np.nan_to_num(levels.mean[0]), 0.0, high)
-        most = np.fmax(level, high - level)
+        is_known = np.isfinite(high)
+        level = np.where(is_known, np.clip(np.nan_to_num(levels.mean[0]), 0.0, high), 0.0)
+        most = np.where(is_known, np.fmax(level, high - level), np.inf)
         for each in levels.contributions:
             with np.errstate(invalid="ignore"):
                 amount = np.fmax(each.below, each.above)[0] + np.nan_to_num(each.share[0] * level)
@@ -342,7 +343,7 @@ class _Work:
                 of_others = np.fmax(of_others, amount)
             elif each.source in _FOLLOWING:
                 of_motion = np.fmax(of_motion, amount)
-        motion = np.fmax(snapshot.data_psd[slice(*edges)].mean(axis=0) - level, level / 1e6)
+        motion = np.fmax(data_means(snapshot, band) - level, level / 1e6)
         with np.errstate(invalid="ignore", divide="ignore"):
             shares = (np.nan_to_num(each / motion) for each in (of_others, of_motion))
         shared, following = (np.fmin(each, 1.0) for each in shares)

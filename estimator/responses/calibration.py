@@ -32,8 +32,9 @@ _PER_INSTRUMENT = 2  # averages for each channel of the other sensors
 _NEIGHBOURS = 16  # frequencies on either side whose noise weights one
 _CORRELATED = 3  # the nearest of them, whose errors are its own
 _STANDS_OUT = 4.0  # noise over that of the neighbours that is not chance
-VARIES = 1.5
-"""Scatter over frequencies, over what errors explain, from which the response varies."""
+_VARIES = 5.0
+"""Standard deviations by which the square of the scatter over frequencies exceeds that of errors,
+from which the response varies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +71,9 @@ class SensorCalibration:
     scatter : float64, shape (d,)
         Standard errors of `gain` by the scatter of the averages alone.
     excess : float
-        Scatter over frequencies relative to the errors of averages: 1 if the model holds. Above
-        1.5, all other errors are those at any frequency of the band.
+        Scatter over frequencies relative to the errors of averages: 1 if the model holds.
+    varies : bool
+        Whether it is above 1 by more than chance: other errors then hold at each frequency.
     dof : float
         Degrees of freedom of the errors.
     n_frequencies : int
@@ -92,6 +94,7 @@ class SensorCalibration:
     is_ambiguous: bool
     scatter: FloatArray = field(metadata=NOT_IN_JSON)
     excess: float
+    varies: bool = field(metadata=NOT_IN_JSON)
     dof: float
     n_frequencies: int = field(metadata=NOT_IN_JSON)
 
@@ -105,12 +108,13 @@ class SensorCalibration:
         """
         M, length = self.matrix.value, self.gain.value
         across = (direction * length)[:, None]
+        beside = np.sqrt(np.maximum(1 - (M / length[:, None]) ** 2, 0.0))
         own = 1.0 - np.eye(len(M))  # the diagonal of `cross_axis` is known
         ratio = self.cross_axis.value
         turned, pairs = np.rad2deg(direction), np.triu_indices(len(M), 1)
         late = direction / (np.pi * (self.low + self.high))
         added = {
-            "matrix": np.hypot(gain[:, None] * M, across),
+            "matrix": np.hypot(gain[:, None] * M, across * beside),
             "gain": gain * length,
             "cross_axis": own * across / np.abs(np.diag(M))[:, None] * np.hypot(1.0, ratio),
             "rotation_deg": np.full(self.rotation_deg.value.shape, turned.max()),
@@ -225,13 +229,16 @@ class CommonMotion:
         covariance = covariance.reshape(d * d, d * d) * inflation / 2
         scatter = with_errors(matrix, covariance)["gain"].error
         delay_cov = _delay_covariance(pair, matrix, omega) * inflation / 2
-        if excess > VARIES:
+        by_chance = 1 + _VARIES * np.sqrt(inflation / len(f)) / d
+        varies = excess**2 > by_chance * (1 + d / self.n_effective)
+        if varies:
+            beyond = 1 - 1 / excess**2  # of the scatter, errors of averages are the rest
             share = np.einsum("faa->f", pair.weight).real
             rows = residual.real.reshape(len(f), d * d)
-            covariance = covariance + (rows * share[:, None]).T @ rows / share.sum()
+            covariance = covariance + beyond * (rows * share[:, None]).T @ rows / share.sum()
             phase = np.einsum("fca,fab,cb->fc", residual, pair.weight, matrix).imag
             phase /= np.sqrt(energy) * np.sqrt(omega**2 @ energy)
-            delay_cov = delay_cov + phase.T @ phase
+            delay_cov = delay_cov + beyond * phase.T @ phase
         else:
             covariance, delay_cov = (max(1.0, excess**2) * e for e in (covariance, delay_cov))
         unknown = np.nan if pair.is_ambiguous else 0.0
@@ -249,6 +256,7 @@ class CommonMotion:
             is_ambiguous=pair.is_ambiguous,
             scatter=scatter,
             excess=excess,
+            varies=bool(varies),
             dof=2 * max(self.n_effective - d, 1.0) * len(f) / inflation,
             n_frequencies=len(f),
         )

@@ -9,7 +9,6 @@ from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, student_quantile
-from estimator.responses.calibration import VARIES
 from estimator.wording import signed, span
 from tui.page.table import Table
 
@@ -39,14 +38,14 @@ _SOURCES = {
     "sensitivity": ("sens.", "twice the uncertainty of the sensitivity"),
     "edges": ("edges", "leakage at the edges of segments"),
     "gaps": ("gaps", "leakage by gaps"),
-    "misfit": ("misfit", "motion that the model does not explain"),
+    "misfit": ("misfit", "power that the model does not explain"),
     "shared-noise": ("shared", "noise that channels share"),
     "dimensions": ("dim.", "doubtful number of dimensions of the motion"),
     "axes": ("axes", "motion outside the sensors' axes"),
     "faulty": ("faulty", "a faulty channel"),
     "drift": ("drift", "change of the response during the recording"),
     "changes": ("changes", "motion that a change of the response leaves in the noise"),
-    "linearity": ("lin.", "squares and cubes of the motion"),
+    "linearity": ("lin.", "squares and cubes of the motion, and what follows it"),
 }
 """Short and in words."""
 
@@ -259,7 +258,7 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
         f"{each.excess:.2g} times the errors, or not all motion is common. Values are means over "
         "the band weighted by SNR, and uncertainties those at each frequency."
         for each in found.sensors
-        if each.excess > VARIES
+        if each.varies
     ]
     return lines + [
         f"{snapshot.sensor_names[sensor]} is not calibrated: {why}"

@@ -169,6 +169,11 @@ def test_a_response_that_varies_over_the_band_is_detected() -> None:
     rising[:, 3:6] += 0.06 * spectra.settings.frequencies[:, None] / 25
     found = motion_of(spectra, rising[:, :, None] * rising[:, None, :]).calibrated(1, (1.0, 20.0))
     assert found.excess > 1.5
+    assert found.varies
+    rising[:, 3:6] = 1 + (rising[:, 3:6] - 1) / 3  # from .1 to 1.6 %, in a scatter as large
+    found = motion_of(spectra, rising[:, :, None] * rising[:, None, :]).calibrated(1, (1.0, 20.0))
+    assert 1.05 < found.excess < 1.5
+    assert np.all(found.gain.error > 0.5 * 0.02 * 19 / 25 / np.sqrt(12))
 
 
 def test_curves_follow_the_response() -> None:
