@@ -275,13 +275,15 @@ def _number(path: Path, array: NDArray[Any]) -> float:
 
 
 def _instant_ns(path: Path, array: NDArray[Any]) -> int:
+    text = str(array.reshape(()).astype(str)).removesuffix("Z").removesuffix("+00:00")
     try:
-        text = str(array.reshape(()).astype(str)).removesuffix("Z").removesuffix("+00:00")
-        found = np.datetime64(text)
+        day, found = (
+            np.array(each, dtype) for each, dtype in ((text[:10], "M8[D]"), (text, "M8[ns]"))
+        )
     except ValueError:
-        found = np.datetime64("NaT")
-    if not _FIRST < found < _LAST:  # a number would be a year
+        day = found = np.array("NaT", "M8[ns]")
+    if text[4:5] != "-" or not _FIRST < day < _LAST:  # a number would be a year
         raise ImportFormatError(
             f"{path}: start_time: expected one UTC time as in 2026-11-21T03:00:00, found {array}"
         )
-    return int(found.astype("datetime64[ns]").astype(np.int64))
+    return int(found.astype(np.int64))
