@@ -183,8 +183,9 @@ def _bounds(psd: FloatArray, levels: Levels, edges: NDArray[np.int64]) -> FloatA
         for each in (np.where(known, psd[inside], 0.0), known.astype(np.float64))
     )
     mean = total / np.maximum(count, 1.0)
-    off = np.fmax(inner_low - np.fmax(low, 0.0), high - inner_high)
-    off = np.where(mean > high, mean, np.fmax(off, 0.0))
+    with np.errstate(invalid="ignore"):
+        off = np.fmax(inner_low - np.fmax(low, 0.0), high - inner_high)
+    off = np.where(mean > high, mean, np.where(np.isinf(high), high, np.fmax(off, 0.0)))
     found = np.zeros(psd.shape)
     found[inside] = np.repeat(np.where(np.isnan(off), 0.0, off), sizes, axis=0)
     return found
