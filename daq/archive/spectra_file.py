@@ -180,7 +180,7 @@ class Described:
 
     @property
     def document(self) -> dict[str, Any]:
-        """All but the channels, as JSON has it."""
+        """All but the channels and the precision of matrices, as JSON has it."""
         return {
             **{key: getattr(self.origin, name) for name, (key, _) in _ORIGIN.items()},
             "usable": self.usable,
@@ -549,6 +549,6 @@ def _attribute(value: object) -> object:
 
 def _value(name: str, attribute: Any) -> Any:  # noqa: ANN401 - any value of JSON
     """Return what was written as an attribute."""
-    if name in _TEXTS or not isinstance(attribute, str):
+    if name in _TEXTS or not isinstance(attribute, str) or attribute[:1] not in {"{", "["}:
         return attribute
     return json.loads(attribute)
