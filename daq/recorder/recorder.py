@@ -319,7 +319,8 @@ class _Recorder:
             RecordingWriter.create, bench=self.bench, sensors=ordered, control=address
         )
         self.attributes = {**self.attributes, **dict.fromkeys(caveats_of(self.bench), 1)}
-        attributes = dict(self.attributes, **({} if duration is None else {"duration": duration}))
+        until = {} if duration is None else {"duration": duration}
+        attributes = {**self.attributes, **until}
         writer = self._new_file(self._path, created=self._started, attributes=attributes)
         writer.event(Event("", EventKind.STARTED, f"{len(ordered)} sensors", self._started))
         _LOGGER.info("recording to %s", self._path, extra={"recording": str(self._path)})

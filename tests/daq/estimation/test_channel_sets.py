@@ -79,6 +79,7 @@ WHOLE_SENSORS = {"A0": [1], "A1": [1], "A2": [1], "B0": [2], "B1": [2], "B2": [2
     ("names", "lacking", "octaves"),
     [
         ("ABC", DAYS, False),
+        pytest.param("ABC", DAYS, True, marks=pytest.mark.long),
         ("ABC", NEVER_TOGETHER, False),
         ("ABC", NEVER_TOGETHER, True),
         ("ABCD", WHOLE_SENSORS, False),

@@ -66,6 +66,7 @@ def recording(
         ({"clocks": "nominal"}, {"gaps": ((3500, 3520), (4500, 4505))}),
         ({"clocks": "nominal", "octaves": True}, {}),
         ({"clocks": "nominal", "reject": True}, {}),
+        pytest.param({"clocks": "nominal", "reject": False}, {}, marks=pytest.mark.long),
         ({}, {}),
         ({}, {"utc": True}),
     ],

@@ -239,9 +239,11 @@ def test_products_of_pieces_are_those_that_are_added(
         made.append(found)
         return found
 
-    def added(self: CrossSpectra, spectra: np.ndarray, of: np.ndarray | None = None) -> None:
+    def added(
+        self: CrossSpectra, spectra: np.ndarray, of: np.ndarray | None, *, places: np.ndarray
+    ) -> None:
         used.append(of)
-        add(self, spectra, of)
+        add(self, spectra, of, places=places)
 
     monkeypatch.setattr(CrossSpectra, "products", noted)
     monkeypatch.setattr(CrossSpectra, "add_spectra", added)

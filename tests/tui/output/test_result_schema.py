@@ -21,6 +21,7 @@ from daq.recording.reader import Recording
 from daq.recording.sensor_record import _NEWEST_ROWS
 from docs.schema import texts
 from tests.daq.clocks.recordings import write_polled
+from tests.full_disk import files_limited_to
 from tests.tui.night_recording import HOSTILE, record
 from tests.tui.schemas import SCHEMAS, thinned, validate, validator
 from tui.commands.main import app
@@ -173,3 +174,14 @@ def test_a_growing_recording_has_no_checksum(tmp_path: Path) -> None:
     validate("result-2", found[0])
     assert found[0]["recordings"][0]["sha256"] is None
     assert found[0]["recordings"][0]["state"] == "growing"
+
+
+def test_a_full_disk_leaves_the_earlier_file(written: Written, tmp_path: Path) -> None:
+    out = tmp_path / "result"
+    out.write_text("the earlier one", encoding="utf-8")
+    arguments = ["estimate", str(written.recording), "--segment", "1s", "--json", str(out)]
+    with files_limited_to(1_000):
+        result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 3
+    assert out.read_text(encoding="utf-8") == "the earlier one"
+    assert list(tmp_path.iterdir()) == [out]
