@@ -236,5 +236,5 @@ def serve_devices(
         _LOGGER.info("%d sensors served at %g times real time", len(bench.sensors), speed)
         if out is not None:
             hint(f"Next: huddle run {out}. Ctrl-C ends the devices.")
-        while True:
-            time.sleep(3600)
+        while True:  # a signal that comes just before a sleep is seen after it
+            time.sleep(1)

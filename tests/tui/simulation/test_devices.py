@@ -45,7 +45,10 @@ def test_nothing_is_left_of_devices_that_are_terminated(tmp_path: Path) -> None:
         assert set(json.loads(process.stdout.readline())["ports"]) == {"A", "B", "C"}
         assert list(folder.iterdir())
         process.send_signal(signal.SIGTERM)
-        assert process.wait(limit()) == 130
+        try:
+            assert process.wait(limit()) == 130
+        finally:
+            process.kill()
     assert not list(folder.iterdir())
 
 
