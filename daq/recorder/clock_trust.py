@@ -126,9 +126,9 @@ class ClockWatch:
         self._reported = at
         state = self._state()
         text = "state unknown: the system does not tell" if state is None else state.text
-        if is_step:  # in one step, or in several that are too small to be reported
+        if is_step:  # at once, in small steps, or by drift
             self._ahead = ahead
-            text = f"set by {step:+.3f} s; the times of this recording do not follow; {text}"
+            text = f"moved by {step:+.3f} s; the times of this recording do not follow; {text}"
         return Event("", EventKind.CLOCK, text, now)
 
 

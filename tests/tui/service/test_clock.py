@@ -191,7 +191,7 @@ def test_a_clock_that_jumps_within_a_run(tmp_path: Path, devices: Bench, step: t
         assert SECONDS / 2 < length < SECONDS + 60  # a busy computer ends it late
         assert recording.closed
         said = [event.text for event in recording.events if event.kind == EventKind.CLOCK]
-    (stated,) = re.findall(r"set by ([+-][\d.]+) s", "".join(said))
+    (stated,) = re.findall(r"moved by ([+-][\d.]+) s", "".join(said))
     assert float(stated) == pytest.approx(step.total_seconds(), abs=0.05)
 
 
