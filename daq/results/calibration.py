@@ -301,7 +301,8 @@ class _Work:
     def widened(self, found: SensorCalibration, budgets: Sequence[Budget]) -> SensorCalibration:
         """Return a calibration whose matrix, angles and delays have what budgets of gains have.
 
-        But its scatter and the sensitivity of the reference. Changes of gains turn nothing.
+        Their scatter is in them already, and the sensitivity of the reference is none of theirs.
+        Changes of gains turn nothing.
         """
         diagnosis = self.snapshot.diagnostics.diagnosis
         changes = diagnosis.stability.changes if diagnosis and diagnosis.stability else ()

@@ -532,8 +532,8 @@ _COLUMNS = ("key", *_FIELDS)
 
 
 def _row(run: Run) -> dict[str, Any]:
-    fields = {name: write(getattr(run, own)) for name, (own, write, _) in _FIELDS.items()}
-    return {"key": run.key} | fields
+    stored = {name: write(getattr(run, own)) for name, (own, write, _) in _FIELDS.items()}
+    return {"key": run.key} | stored
 
 
 def _run(row: dict[str, Any]) -> Run:
