@@ -47,6 +47,8 @@ AT_SOFT_END = 0.25
 SLOPES, MIN_ON_SLOPES = 1 / 8, 0.03
 """Part of the range at an end, without the end itself, that a clipped signal also passes: samples
 there over those at the end. Square waves and sines in step with the sampling have none."""
+SELDOM = 0.01
+"""Share of samples at the ends that needs no slopes: waves are there more often."""
 BITS = range(8, 33)
 """Sizes of counters and words that wrap."""
 AROUND = 8
@@ -223,8 +225,9 @@ def share_at_ends(counts: NDArray[Any]) -> float:
             return 0.0
         ends = ((times[0], times[1:BESIDE].max()), (times[-1], times[-BESIDE:-1].max()))
         cut = [int(end) for end, beside in ends if end >= max(MIN_AT_END, TIMES * beside)]
-        if cut and _has_slopes(values, times, sum(cut)):
-            return sum(cut) / len(counts)
+        n_cut = sum(cut)
+        if cut and (n_cut < SELDOM * len(counts) or _has_slopes(values, times, n_cut)):
+            return n_cut / len(counts)
     signal = counts.astype(np.float64)
     return sum(max(_at_soft_end(own, parts) for parts in WIDTHS) for own in (signal, -signal))
 

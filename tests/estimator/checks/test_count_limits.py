@@ -85,6 +85,14 @@ def test_a_signal_that_is_cut_off_is_clipped(signal: Signal, noise: float) -> No
     assert 0.5 * wanted < share < 1.5 * wanted
 
 
+def test_knocks_that_all_reach_the_end_are_clipped() -> None:
+    """Hardly a sample lies on their slopes."""
+    rng = np.random.default_rng(2)
+    knocked = 100 * rng.standard_normal(20_000)
+    knocked[rng.integers(0, 20_000, 60)] *= 1e6
+    assert 55 <= 20_000 * share_at_ends(np.rint(np.clip(knocked, -3000, 3000))) <= 60
+
+
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16, 18, 20, 24, 28, 32])
 @pytest.mark.parametrize("offset", [0.0, 0.4], ids=["centred", "offset"])
 @pytest.mark.parametrize("signed", [True, False])
