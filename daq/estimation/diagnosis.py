@@ -34,6 +34,7 @@ from estimator.checks.advice_on_noise import (
     SharedNoise,
 )
 from estimator.checks.advice_on_sensors import Delay, Gain
+from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.diagnose import Diagnostics, diagnose
@@ -470,7 +471,8 @@ def _counts(
         return by is next(of_it, None)
     if isinstance(advice, DisturbedSegments):
         return by is next(e for e in reversed(found) if e.stability is not None)
-    return by is clearest or not advice.sensors or isinstance(advice, NoiseChanges | SharedNoise)
+    in_each = isinstance(advice, NoiseChanges | NoSharedMotion | SharedNoise)
+    return by is clearest or not advice.sensors or in_each
 
 
 def _is_explained(advice: Advice, faulty: Collection[int]) -> bool:

@@ -12,6 +12,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfilt
 
+import huddle
 from daq.bench.channel import Channel
 from daq.errors import CannotAlignError
 from daq.estimation.contributions import contributions
@@ -105,6 +106,19 @@ def test_what_is_wrong_is_said_within_a_minute_while_recording(tmp_path: Path) -
     assert swapped
     assert all(1 in each.sensors for each in swapped)
     assert list(snapshot.diagnostics.counts.clipped) == [9]
+
+
+def test_a_sensor_whose_time_is_18_s_off_bounds_no_octave() -> None:
+    """The seconds between GPS time and UTC; it has no level in any octave, and none is too high."""
+    rng = np.random.default_rng(18)
+    motion = 30 * rng.standard_normal((60_000, 3))
+    samples = {name: motion + rng.standard_normal(motion.shape) for name in "ABC"}
+    samples["A"] = np.roll(motion, 1800, axis=0) + rng.standard_normal(motion.shape)
+    snapshot = huddle.self_noise(samples, fs=100.0, segment="10s", octaves=True).snapshot
+    found = Result(snapshot, Settings())
+    for edge in (0.5, 2.0, 12.0, 30.0):
+        for mean in found.means(found.method, (edge, 1.5 * edge)):
+            assert mean.low[0] <= 0.02 <= mean.high[0]
 
 
 @pytest.mark.parametrize(
