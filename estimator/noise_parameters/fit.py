@@ -158,7 +158,7 @@ def fit(
     EstimatorError
         If shapes do not fit.
     InsufficientDataError
-        If fewer than 24 frequencies of the band have an estimate.
+        If fewer than 24 frequencies of the band have an estimate, or most of a part of it are zero.
     """
     if not (frequency.shape == noise_psd.shape == cov.shape and frequency.ndim == 1):
         raise EstimatorError(
@@ -169,6 +169,12 @@ def fit(
     f, y, number = frequency[used], noise_psd[used], np.flatnonzero(used)
     sd = (np.abs(noise_psd) * cov)[used]
     groups = _groups(len(f))
+    for first, stop in pairwise(groups):
+        if not median(np.abs(y[first:stop])):
+            raise InsufficientDataError(
+                f"the estimate is zero at most frequencies of {f[first]:.3g} to {f[stop - 1]:.3g}"
+                " Hz; it has no terms"
+            )
     terms = terms_at(f, resolution(frequency)[used])
     every = np.ones(len(f), dtype=np.bool_)
     values, sigma = _converged(terms, y, sd, groups, keep=every, most=OUTLIER)

@@ -170,6 +170,9 @@ def test_too_little_and_mismatched_input_is_refused() -> None:
         fit(FREQUENCY[:9], psd[:9], cov[:9], INDEPENDENT)
     with pytest.raises(InsufficientDataError, match="0 frequencies"):
         fit(FREQUENCY, np.full_like(psd, np.nan), cov, INDEPENDENT)
+    psd[: len(psd) // 4] = 0.0  # of one of two copies that differ by a sample
+    with pytest.raises(InsufficientDataError, match="zero at most frequencies"):
+        fit(FREQUENCY, psd, cov, INDEPENDENT)
     with pytest.raises(EstimatorError, match="one shape"):
         fit(FREQUENCY, psd[:-1], cov, INDEPENDENT)
 
