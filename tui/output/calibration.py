@@ -11,6 +11,7 @@ from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, student_quantile
 from estimator.wording import signed, span
 from tui.page.table import Table
+from tui.wording.formatting import plain_number
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -95,7 +96,9 @@ def angle(degrees: float, error: float, k: float) -> str:
 
 
 def share(relative: float) -> str:
-    """Return a relative uncertainty in per cent, to two digits."""
+    """Return a relative uncertainty in per cent, to two digits; ∞ where there is no limit."""
+    if not math.isfinite(relative):
+        return "∞"
     if relative < _LEAST_SHOWN:
         return "< 0.001 %" if relative > 0 else "0"
     rounded = float(f"{100 * relative:.2g}")
@@ -185,7 +188,11 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
     rows = []
     for budget in budgets:
         shares = {each.source: share(each.relative) for each in budget.components}
-        totals = share(budget.combined), f"{budget.k:.2f}", share(budget.k * budget.combined)
+        totals = (
+            share(budget.combined),
+            plain_number(budget.k, ".2f"),
+            share(budget.k * budget.combined),
+        )
         parts = (shares.get(source, "") for source in sources)
         rows.append((budget.sensor, budget.channel, *parts, *totals))
     return _table(header, rows)

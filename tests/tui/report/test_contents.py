@@ -334,13 +334,14 @@ def test_two_sensors_cannot_be_calibrated() -> None:
 
 
 def test_shares_are_short() -> None:
-    assert [share(each) for each in (0.0, 1e-9, 0.00021, 0.05, 0.996, 1.234)] == [
+    assert [share(each) for each in (0.0, 1e-9, 0.00021, 0.05, 0.996, 1.234, math.inf)] == [
         "0",
         "< 0.001 %",
         "0.021 %",
         "5 %",
         "100 %",
         "120 %",
+        "∞",
     ]
 
 
