@@ -21,6 +21,7 @@ datasets of a sensor to the shortest.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import uuid
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
     from daq.protocols.block import Block, Event, HostTime, Reading
     from daq.recording.file_format import SensorLayout
 
-
+_LOGGER = logging.getLogger(__name__)
 _MIN_CHUNK_ROWS = 64
 
 
@@ -489,15 +490,24 @@ class RecordingWriter:
         return {**rows, "": (self._events.written, self._readings.written)}
 
     def _check_place(self) -> None:
-        """Check that the file still has its name, so that users can find it."""
-        place = self._hidden or self.path
-        written = os.fstat(self._handle)
+        """Check that the file still has its name; give it back to a file that was renamed.
+
+        Readers, the journal and a service know the file by this name. The other name stays.
+        """
+        place, handle = self._hidden or self.path, self._handle
+        written = os.fstat(handle)
+        if not place.exists():
+            with contextlib.suppress(OSError):  # removed, not Linux, or a disk without hard links
+                # Linux follows the link to the open file only where a folder's descriptor is given.
+                os.link(f"/proc/self/fd/{handle}", place, src_dir_fd=handle, follow_symlinks=True)
+                _LOGGER.warning("%s was renamed while it is recorded: it has both names now", place)
         try:
             found = place.stat()
         except FileNotFoundError:
             found = None
         if found is None or not os.path.samestat(found, written):
-            what = "removed or renamed" if found is None else "replaced by another file"
+            gone = "renamed" if written.st_nlink else "removed"
+            what = gone if found is None else "replaced by another file"
             raise RecordingError(f"{place}: {what} while it was recorded; the recording ends here")
 
     def _write_again(self) -> None:
