@@ -220,7 +220,7 @@ _WAITING = ("clocks", "accelerated day")
 
 def _brief(remarks: list[str]) -> str:
     """Return the remarks of a service that the page shows."""
-    return "; ".join(each for each in remarks if not each.startswith(("kills", "reasons")))
+    return "; ".join(each for each in remarks if not each.startswith("kills"))
 
 
 def _share(n: int, share: float) -> int:

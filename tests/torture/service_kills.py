@@ -232,6 +232,12 @@ def faults(
     return found + [f"{part}: of no run" for part in sorted(there - kept)]
 
 
+def _reason(run: Run) -> str:
+    """Return the state and first line of why a run failed or ended early, without folders."""
+    reason = re.sub(r"/[^ :]+", "…", run.reason.partition("\n")[0])
+    return f"{run.state}: {reason[:100]}" if reason else ""
+
+
 def slope(usage: list[tuple[float, ...]], column: int) -> tuple[float, float] | None:
     """Return the trend per hour within processes, and its standard error; None if it is too short.
 
@@ -302,7 +308,7 @@ def soak(
         f"{time.monotonic() - begin:.0f} s at {rate:g} times real time",
         f"kills {dict(service.kills)}, {n_steps} clock steps",
         f"runs {dict(states)}, {sum(len(run.parts) > 1 for run in runs)} of several parts",
-        f"reasons {dict(Counter(re.sub(r'/[^ :]+', '…', run.reason)[:100] for run in runs))}",
+        *(f"{n} × {reason}" for reason, n in Counter(filter(None, map(_reason, runs))).items()),
     ]
     used = np.array(service.usage)
     allowed = (
