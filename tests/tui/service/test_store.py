@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
+import runpy
 import threading
 from dataclasses import replace
 from datetime import timedelta
+from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -19,7 +23,7 @@ from tui.commands.main import app
 from tui.commands.runs import PAGE
 from tui.service.records.run_state import RecordedNoise, Run, RunState
 from tui.service.records.storage import MIN_KEPT_RUNS, tidy
-from tui.service.records.store import RunStore
+from tui.service.records.store import RunStore, StoreError
 
 NOISE = RecordedNoise("A", "M", "7", "x", "m/s²", "three-sensor", 1.0, 10.0, 1e-12, 5e-13, 2e-12)
 
@@ -90,6 +94,20 @@ def test_simulated_runs_are_marked(store: RunStore) -> None:
     assert [bool(caveats) for *_, caveats in store.noise("lab")] == [n == 2 for n in range(4)]
     store.save(run_at(2))  # again, as after a restart: the mark stays
     assert store.runs("lab")[2].caveats
+
+
+def test_a_database_of_before_a_caveat_receives_its_table(
+    store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {each.name: each.value for each in Caveat}
+    later: Any = StrEnum("Later", names | {"LENT": "lent"})  # type: ignore[misc]
+    monkeypatch.setattr("daq.caveats.Caveat", later)
+    found = runpy.run_path(inspect.getfile(RunStore))["RunStore"](store.path.parent)
+    found.save(replace(run_at(2), caveats=Caveats(later)))
+    assert [bool(run.caveats) for run in found.runs("lab")] == [n == 2 for n in range(7)]
+    assert len(found.runs("lab")[2].caveats) == len(later)
+    with pytest.raises(StoreError, match="written by a newer version"):
+        store.runs()
 
 
 def test_questions_of_a_database_that_does_not_exist_make_none(tmp_path: Path) -> None:

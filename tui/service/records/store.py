@@ -34,7 +34,8 @@ from tui.service.records.run_state import (
 )
 
 NAME = "runs.sqlite"
-VERSION = 1
+VERSION = len(Caveat)
+"""A further caveat has a further table, which databases of before receive."""
 COPIES = 7
 """Daily copies that are kept."""
 EMPTY = "it is empty"
