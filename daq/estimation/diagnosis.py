@@ -149,20 +149,25 @@ class Findings:
         return replace(self, diagnosis=replace(whole, advice=advice, stability=steady))
 
     def beside_clocks(self, clocks: Sequence[ClockState]) -> Findings:
-        """Return findings without changes that clocks explain, which drift or are unchecked.
+        """Return findings without changes that clocks explain, as one drifts.
 
-        These look like a gain or a turn beyond what benches do, or change some frequencies more.
+        These look like a gain or a turn beyond what benches do, or change some frequencies more. Of
+        a sensor whose clock is unchecked, either may be the cause.
         """
         whole = self.diagnosis
         if whole is None or not any(each.drifts or each.unchecked for each in clocks):
             return self
-        advice = tuple(
-            each
-            for each in whole.advice
-            if not isinstance(each, ResponseChanges)
-            or (each.band is None and abs(each.size) < BY_CLOCKS)
-        )
-        return replace(self, diagnosis=replace(whole, advice=advice))
+        drifts = any(each.drifts for each in clocks)
+        advice: list[Advice] = []
+        for each in whole.advice:
+            if not isinstance(each, ResponseChanges) or (
+                each.band is None and abs(each.size) < BY_CLOCKS
+            ):
+                advice.append(each)
+            elif not drifts:
+                is_unchecked = clocks[each.sensors[0]].unchecked
+                advice.append(replace(each, is_unchecked=is_unchecked))
+        return replace(self, diagnosis=replace(whole, advice=tuple(advice)))
 
     def of_all_segments(self, *, unless: bool = False) -> Findings:
         """Return findings of which the averages within parts are not used."""

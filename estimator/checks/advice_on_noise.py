@@ -204,6 +204,8 @@ class ResponseChanges(Advice):
     variance : float
         Noise that the change adds in the average of all segments, as a fraction of the motion's
         PSD, for the worst channel.
+    is_unchecked : bool
+        Whether the clock of the sensor, which was not checked, may be the cause.
     """
 
     channel: int | None
@@ -213,6 +215,7 @@ class ResponseChanges(Advice):
     begin: Seconds
     end: Seconds
     variance: Share
+    is_unchecked: bool = field(default=False, metadata=NOT_IN_JSON)
 
     def _words(self, names: Names) -> Words:
         own = names.list_sensors(self.sensors)
@@ -243,7 +246,8 @@ def _response_change(advice: ResponseChanges, names: Names) -> str:
         by = "more than half" if _is_large_fall(advice) else percent(abs(advice.size))
         what = f"The gain of {whose} {direction} by {by}"
     begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
-    return f"{what} at {begin}" if begin == end else f"{what} from {begin} to {end}"
+    when = f"at {begin}" if begin == end else f"from {begin} to {end}"
+    return f"{what} {when}{', or its times drift' if advice.is_unchecked else ''}"
 
 
 def _clock_time(names: Names, seconds: float) -> str:

@@ -298,12 +298,16 @@ class Stability:
 
 
 def _in_all_bands(
-    explained: FloatArray, changes: Sequence[ResponseChange], dims: tuple[int, ...]
-) -> FloatArray:
-    """Return what changes explain, also in bands whose few averages do not show it."""
+    explained: FloatArray,
+    changes: Sequence[ResponseChange],
+    dims: tuple[int, ...],
+    whole: tuple[float, float],
+) -> tuple[FloatArray, tuple[ResponseChange, ...]]:
+    """Return what changes explain, also in bands whose few averages do not show it, and these."""
     sensor = np.repeat(np.arange(len(dims)), dims)
     moved = np.isin(sensor, [each.sensor for each in changes])
-    return np.where(moved & (explained == 0), explained.max(axis=0), explained)
+    found = tuple(replace(each, band=each.band and whole) for each in changes)
+    return np.where(moved & (explained == 0), explained.max(axis=0), explained), found
 
 
 def _groups(averages: FloatArray, q: int, n_channels: int) -> tuple[list[IntArray], bool]:
@@ -437,7 +441,7 @@ def stability(
     )
     explained = np.maximum(explained, left)
     if is_short:
-        explained = _in_all_bands(explained, changes, dims)
+        explained, changes = _in_all_bands(explained, changes, dims, (low[0], high[-1]))
     if without is not None:
         kept = np.array([not np.isin(some, without.left_out).any() for some in groups])
         if kept.sum() >= MIN_PARTS:

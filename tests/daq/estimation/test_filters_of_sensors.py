@@ -105,7 +105,17 @@ def test_what_clocks_explain_is_no_change_of_a_response() -> None:
     snapshot = estimated(2, *RISES, ratio=1e4)
     found = Findings(diagnosis=snapshot.diagnostics.diagnosis)
     assert found.beside_clocks(snapshot.clocks) == found
-    unchecked = [replace(clock, unchecked=True) for clock in snapshot.clocks]
-    after = found.beside_clocks(unchecked).diagnosis
-    assert after is not None
-    assert not [each for each in after.advice if isinstance(each, ResponseChanges)]
+
+    def changes(column: int, *, drifts: bool = False, unchecked: bool = False) -> list[str]:
+        clocks = list(snapshot.clocks)
+        clocks[column] = replace(clocks[column], drifts=drifts, unchecked=unchecked)
+        after = found.beside_clocks(clocks).diagnosis
+        assert after is not None
+        own = [each for each in after.advice if isinstance(each, ResponseChanges)]
+        return [each.words(snapshot.names).line for each in own]
+
+    assert changes(0, drifts=True) == []
+    (line,) = changes(1, unchecked=True)
+    assert ", or its times drift; " in line
+    (line,) = changes(0, unchecked=True)  # as of a dead sensor: it hid the changes of others
+    assert "times" not in line
