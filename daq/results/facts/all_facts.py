@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,11 @@ from daq.results.facts.precision import facts_of_precision
 from daq.results.facts.recordings import facts_of_recordings
 from daq.results.facts.segments import facts_of_segments
 from estimator.checks.advice import Advice, Rank
-from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_noise import ResponseChanges, SharedNoise
+from estimator.checks.advice_on_sensors import Gain
+
+MUCH, SEVERAL = 0.5, 3.0
+"""Change of a gain that may explain any other mean, and times a smaller one that may."""
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:
@@ -79,7 +84,11 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
     Those outside of the band asked for go by themselves: they must not hide what is inside.
     """
     kinds: dict[tuple[type[Advice], bool], list[Advice]] = {}
-    for each in map(partial(_or_two_alone, snapshot), snapshot.diagnostics.advice):
+    advice = snapshot.diagnostics.advice
+    changed = [each for each in advice if isinstance(each, ResponseChanges) and not each.is_turn]
+    for each in map(partial(_or_two_alone, snapshot), advice):
+        if isinstance(each, Gain) and any(_explains(change, each) for change in changed):
+            continue
         kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
     ranks, names = list(Rank), snapshot.sensor_names
     for found in kinds.values():
@@ -97,6 +106,12 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
             findings=tuple(found),
             names=snapshot.names,
         )
+
+
+def _explains(change: ResponseChanges, gain: Gain) -> bool:
+    """Whether a gain may be the mean of one that changes, which biases the noise."""
+    most = SEVERAL * abs(change.size) if abs(change.size) < MUCH else math.inf
+    return change.sensors[0] in gain.sensors and abs(math.log(abs(gain.ratio))) < most
 
 
 def _or_two_alone(snapshot: Snapshot, advice: Advice) -> Advice:

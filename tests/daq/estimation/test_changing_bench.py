@@ -246,6 +246,7 @@ def test_of_few_averages_beside_weak_motion_a_large_step_is_no_noise(
     result = Result(snapshot, Settings())
     for mean in result.means(result.method, (1.0, 0.4 * rate))[:3]:
         assert mean.low[0] <= (1 + step**2) / rate <= mean.high[0]
+    assert not any("no bias" in fact.words.explanation for fact in result.facts)
 
 
 @pytest.mark.parametrize(
