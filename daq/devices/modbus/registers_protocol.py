@@ -127,6 +127,11 @@ class RegisterMap:
         return found
 
     @property
+    def resolution_ns(self) -> int:
+        """Resolution of the device's time, in ns."""
+        return _TICK_NS.get(self.time_format, 10**6)
+
+    @property
     def _extents(self) -> list[tuple[int, int]]:
         words = self.dtype.itemsize // 2
         extents = [(address, words) for address in self.addresses]
@@ -304,7 +309,7 @@ class RegisterDecoder:
         self._last_instant: int | None = None
         self._last_key: int | None = None
         self._sent_before: int | None = None
-        self._device_time = _DeviceTime(_TICK_NS.get(registers.time_format, 10**6))
+        self._device_time = _DeviceTime(registers.resolution_ns)
 
     def receive(
         self, registers: Sequence[int], sent: HostTime, at: HostTime

@@ -208,6 +208,12 @@ def bench_at(driver: str, port: str, settings: Sequence[dict[str, Any]]) -> str:
         (
             "registers",
             BUS,
+            [{"address": 0, "time_address": 9, "time_format": "uint32-s"}],
+            "expected at most 1 Hz, as the time has steps of 1 s",
+        ),
+        (
+            "registers",
+            BUS,
             [{"preset": "witmotion", "baud_rate": 115200}, {"address": 0, "baud_rate": 9600}],
             "settings.baud_rate = 9600: expected 115200, as of 'A'",
         ),
