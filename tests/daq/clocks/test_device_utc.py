@@ -178,6 +178,7 @@ def three_sensors(path: Path, lost: dict[str, list[float]]) -> Path:
 @pytest.mark.parametrize(
     "lost",
     [
+        {"b": [82.0, 84.0]},
         {"b": np.arange(5, 155, 7.0).tolist()},
         {"a": np.arange(5, 155, 7.0).tolist()},
         {
@@ -186,7 +187,7 @@ def three_sensors(path: Path, lost: dict[str, list[float]]) -> Path:
             "c": [5.0, 40.0, 75.0, 110.0, 145.0],
         },
     ],
-    ids=["every segment", "every segment of the reference", "all sensors"],
+    ids=["twice", "every segment", "every segment of the reference", "all sensors"],
 )
 def test_the_noise_is_the_true_one(tmp_path: Path, lost: dict[str, list[float]]) -> None:
     snapshot = estimate([three_sensors(tmp_path / "r.h5", lost)])

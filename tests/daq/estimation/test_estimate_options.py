@@ -155,9 +155,12 @@ def test_what_was_followed_ends_as_the_estimate_from_the_file(
     np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9)
 
 
-def test_a_channel_that_is_not_measured_for_a_while_counts_as_faulty(tmp_path: Path) -> None:
+@pytest.mark.parametrize("slope", [0.0, 3.7])
+def test_a_channel_that_is_not_measured_for_a_while_counts_as_faulty(
+    slope: float, tmp_path: Path
+) -> None:
     sensors = bench()
-    sensors["b"].counts[4000:7000, 1] = np.rint(17 + 3.7 * np.arange(3000))
+    sensors["b"].counts[4000:7000, 1] = np.rint(17 + slope * np.arange(3000))
     settings = replace(SETTINGS, reject=False)
     found = estimate([write(tmp_path / "r.h5", sensors)], settings)
     assert found.diagnostics.stood_still == {4: pytest.approx(30, abs=1)}
