@@ -15,7 +15,7 @@ from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import RejectedSegment, SharedRounding
 from daq.recording.interface import ReadableRecording
-from estimator.checks.counts import shared_rounding
+from estimator.checks.counts import shared_rounding, step_of
 from estimator.errors import InsufficientDataError
 from estimator.levels.bands import bin_correlation
 from estimator.levels.pooled import blocks_of
@@ -54,6 +54,7 @@ BY_MOTION = frozenset({"three-sensor", "maximum-likelihood"})
 """Methods that use segments which only some channels have: they pair no channels by number."""
 _WHOLE = 3  # sensors with all channels
 _STRETCHES, _STRETCH = 48, 1024  # samples, of which means are taken
+_FIRST = 1 << 13  # samples, in which the step of digits is looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,18 +416,34 @@ def responses(frequency: FloatArray, channels: Channels, unit: str) -> ComplexAr
     return response
 
 
-def quantisation_psd(
-    frequency: FloatArray, channels: Channels, unit: str, rates: Mapping[str, float]
-) -> FloatArray:
-    """Return the noise of counting in whole numbers, shape (n_freqs, n_channels), in unit**2/Hz.
+def sample_steps(recording: ReadableRecording, channels: Channels) -> FloatArray:
+    """Return the rates in Hz and the steps of samples of all channels, (2, n_channels).
 
-    One count is off by at most half, evenly: a variance of 1/12, spread up to half the rate.
-    `rates` are those of sensors that count in whole numbers, in Hz; NaN for the others.
+    NaN of channels whose samples have no step.
     """
-    steps = np.array([1 / abs(channel.sensitivity) for _, channel in channels])
-    rate = np.array([rates.get(sensor, np.nan) for sensor, _ in channels])
+    known: dict[tuple[str, str], tuple[float, float]] = {}
+    for record in recording.sensors:
+        counts = record.n_samples > 0 and record.counts(0, 1).dtype.kind in "iu"
+        first = record.counts(0, 0 if counts else min(record.n_samples, _FIRST))
+        for channel, own in zip(record.channels, first.T, strict=True):
+            step = 1.0 if counts else step_of(own)
+            known[record.name, channel.name] = record.sampling_rate, step
+    none = np.nan, np.nan
+    return np.array([known.get((sensor, each.name), none) for sensor, each in channels]).T
+
+
+def quantisation_psd(
+    frequency: FloatArray, channels: Channels, unit: str, steps: FloatArray
+) -> FloatArray:
+    """Return the noise of rounding to steps, shape (n_freqs, n_channels), in unit**2/Hz.
+
+    A sample is off by at most half a step, evenly: a variance of 1/12 of its square, spread up to
+    half the rate. `steps` are those of `sample_steps`.
+    """
+    rate, step = steps
+    size = step / np.abs([channel.sensitivity for _, channel in channels])
     with np.errstate(divide="ignore", invalid="ignore"):
-        psd = steps**2 / (6 * rate) / np.abs(responses(frequency, channels, unit)) ** 2
+        psd = size**2 / (6 * rate) / np.abs(responses(frequency, channels, unit)) ** 2
     return np.where(np.isfinite(psd), psd, np.nan)
 
 
@@ -436,21 +453,20 @@ def rounded_alike(
     channels: Channels,
     unit: str,
     *,
-    rates: Mapping[str, float],
+    steps: FloatArray,
     passes: Sequence[Pass],
 ) -> SharedRounding:
     """Return what like channels share of their rounding, and what it does to their noise.
 
-    `rates` are those of sensors that count in whole numbers.
+    `steps` are those of `sample_steps`.
     """
-    names = [sensor for sensor, _ in channels]
-    steps = [channel.sensitivity if name in rates else np.nan for name, channel in channels]
-    counts = responses(frequency, channels, unit) * np.array(steps)
-    sensor = np.unique(names, return_inverse=True)[1]
+    per_unit = np.array([channel.sensitivity for _, channel in channels]) / steps[1]
+    counts = responses(frequency, channels, unit) * per_unit
+    sensor = np.unique([sensor for sensor, _ in channels], return_inverse=True)[1]
 
     def means() -> FloatArray:
         found = [mean for each in passes for mean in _means(each)]
-        return np.asarray(np.array(found) * np.array(steps))
+        return np.asarray(np.array(found) * per_unit)
 
     found = shared_rounding(csm, frequency, counts=counts, sensor=sensor, means=means)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -282,7 +282,7 @@ class Snapshot:
     no_segment : NoSegment or None
         None where a segment counts, or too few would be complete.
     quantisation_psd : float64, shape (n_freqs, n_channels), or None
-        Noise of counting in whole numbers, in unit**2/Hz; NaN for channels that do not. Of a
+        Noise of rounding to counts or digits, in unit**2/Hz; NaN for channels without. Of a
         finished estimate.
     rounded_alike : SharedRounding or None
         What channels of several sensors share of it. Of a finished estimate.

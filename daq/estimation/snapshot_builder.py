@@ -53,6 +53,7 @@ from daq.estimation.noise_estimates import (
     rejected_segments,
     responses,
     rounded_alike,
+    sample_steps,
     shortest_segments,
     with_sets,
 )
@@ -289,7 +290,7 @@ class SnapshotBuilder:
         n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
-        counting = _counting_rates(latest) if final else {}
+        steps = sample_steps(latest, channels) if final else None
         nonlinear, dependent = (
             nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ((), ())
         )
@@ -365,12 +366,12 @@ class SnapshotBuilder:
             sensitivities=stated_sensitivities(recordings),
             caveats=Caveats.joined(recording.caveats for recording in recordings),
             quantisation_psd=(
-                quantisation_psd(frequency, channels, self._unit, counting) if final else None
+                None if steps is None else quantisation_psd(frequency, channels, self._unit, steps)
             ),
             rounded_alike=(
-                rounded_alike(csm, frequency, channels, self._unit, rates=counting, passes=passes)
-                if final
-                else None
+                None
+                if steps is None
+                else rounded_alike(csm, frequency, channels, self._unit, steps=steps, passes=passes)
             ),
         )
         return with_contributions(snapshot)
@@ -685,15 +686,6 @@ def stated_sensitivities(recordings: Sequence[ReadableRecording]) -> Sensitiviti
     known = joined(each.sensitivities for each in outlines if each is not None)
     readings = (each for recording in recordings for each in recording.readings)
     return sensitivities_at(known, readings)
-
-
-def _counting_rates(recording: ReadableRecording) -> dict[str, float]:
-    """Return the rates of the sensors whose samples are whole numbers, in Hz."""
-    return {
-        record.name: record.sampling_rate
-        for record in recording.sensors
-        if record.n_samples and record.counts(0, 1).dtype.kind in "iu"
-    }
 
 
 def _left_out(passes: Sequence[Pass], n_partial: int = 0) -> dict[Reason, int]:

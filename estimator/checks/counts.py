@@ -27,8 +27,28 @@ as much of more than three sensors, of which the likelihood may take some for mo
 CERTAIN = 0.98
 """Share of a variance that is certain to be there: with less of it, more is shared."""
 _ORDERS = np.arange(1, 12)
-_FEWEST = 4  # frequencies
+_FEWEST = 4  # frequencies, or distinct samples
+_OFF = 0.1
+"""Share of a step by which differences of samples may be off its multiples."""
 _KNOTS = np.linspace(0.0, np.sqrt(NEAR), 300) ** 2
+
+
+def step_of(samples: FloatArray) -> float:
+    """Return the step of which all differences of samples are multiples; NaN without one.
+
+    As of the digits of a text, or of floats beside a large mean.
+
+    Parameters
+    ----------
+    samples : float, shape (n_samples,)
+    """
+    gaps = np.diff(np.sort(samples[np.isfinite(samples)].astype(np.float64)))
+    gaps = gaps[gaps > 0]
+    if len(gaps) < _FEWEST - 1:
+        return np.nan
+    step = gaps.sum() / np.rint(gaps / gaps.min()).sum()
+    off = np.abs(gaps / step - np.rint(gaps / step)).max()
+    return float(step) if off < _OFF else np.nan
 
 
 def covariance(variance: FloatArray, cosines: FloatArray | float = 1.0) -> FloatArray:

@@ -150,7 +150,7 @@ def notes(found: Sequence[ChannelParameters]) -> list[str]:
 def quantisation_notes(
     channels: Sequence[ChannelLabel], shares: Sequence[tuple[float, float]]
 ) -> list[str]:
-    """Return which channels' noise is mostly that of counting in whole numbers."""
+    """Return which channels' noise is mostly that of rounding to counts or digits."""
     mostly = [
         f"{label.name} ({percent(min(share, 1.0))})"
         for label, (_, share) in zip(channels, shares, strict=True)
@@ -159,8 +159,8 @@ def quantisation_notes(
     if not mostly:
         return []
     line = (
-        f"Quantisation: most of the noise of {', '.join(mostly)} comes from the size of a count. "
-        "Use a smaller range or more gain to measure the noise of the sensor."
+        f"Quantisation: most of the noise of {', '.join(mostly)} comes from the size of a count or "
+        "digit. Use a smaller range, more gain or digits to measure the noise of the sensor."
     )
     return [line]
 

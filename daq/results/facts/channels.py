@@ -204,7 +204,7 @@ class SensitivitiesDiffer(Fact):
 
 
 class RoundedAlike(Fact):
-    """Channels of several sensors are rounded to counts alike, and share a part of that noise.
+    """Channels of several sensors are rounded alike, and share a part of that noise.
 
     Attributes
     ----------
@@ -215,13 +215,13 @@ class RoundedAlike(Fact):
     share: float
 
     def _words(self) -> Words:
-        alike = "are rounded to counts alike"
+        alike = "are rounded alike"
         return Words(
             f"{few(self.channels)} {alike}: up to {self.share:.0%} of their noise; use smaller "
-            "counts",
+            "steps",
             f"{listed(self.channels)} {alike}. Up to {self.share:.0%} of their noise may be taken "
             "for motion, or counted more than once; the intervals include it.",
-            "Use a smaller range or a higher gain, so that the noise is half a count or more.",
+            "Use a smaller range, a higher gain or more digits: noise of half a step or more.",
         )
 
 

@@ -163,7 +163,7 @@ COARSE = np.array([10, 30, 100, 250, 450])
 
 
 def _levels(
-    own: float, motion: float, n_sensors: int, n_channels: int, seed: int
+    own: float, motion: float, n_sensors: int, n_channels: int, seed: int, *, step: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, list[RoundedAlike]]:
     """Return how many intervals with and without the contribution hold the noise, and the fact."""
     rng = np.random.default_rng([28, seed])
@@ -173,11 +173,13 @@ def _levels(
         offset = rng.uniform(0, 1, n_channels)
         noise = own * rng.standard_normal((N_SAMPLES, n_channels))
         arrays[name] = np.round(moved + offset + noise).astype(np.int32)
+        if step != 1:  # a text of some digits
+            arrays[name] = np.round(250 + step * arrays[name], 3)
     settings = Settings(segment=10.0)
     snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], settings)
     result = next(iter(snapshot.results.values()))
     found = Spectrum(result, snapshot, settings).levels(COARSE)
-    truth = (own**2 + 1 / 12) * 2 / RATE
+    truth = step**2 * (own**2 + 1 / 12) * 2 / RATE
     held = []
     for without in ((), (Source.COUNTS,)):
         low, high = found.ends(without=without)
@@ -190,13 +192,17 @@ def _levels(
 
 
 @pytest.mark.parametrize(
-    ("n_sensors", "n_channels"),
-    [(3, 1), *(pytest.param(*each, marks=pytest.mark.long) for each in ((3, 3), (5, 1)))],
+    ("n_sensors", "n_channels", "step"),
+    [
+        (3, 1, 1.0),
+        (3, 1, 0.002),
+        *(pytest.param(*each, 1.0, marks=pytest.mark.long) for each in ((3, 3), (5, 1))),
+    ],
 )
 def test_noise_that_is_rounded_alike_is_within_its_interval(
-    n_sensors: int, n_channels: int
+    n_sensors: int, n_channels: int, step: float
 ) -> None:
-    found = [_levels(0.15, 3.0, n_sensors, n_channels, seed) for seed in range(4)]
+    found = [_levels(0.15, 3.0, n_sensors, n_channels, seed, step=step) for seed in range(4)]
     held = np.concatenate([each[0].ravel() for each in found])
     without = np.concatenate([each[1].ravel() for each in found])
     assert held.mean() >= 0.95

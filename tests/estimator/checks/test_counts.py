@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from estimator.checks.counts import before_rounding, covariance, shared_rounding
+from estimator.checks.counts import before_rounding, covariance, shared_rounding, step_of
 
 N_SAMPLES, LENGTH = 1 << 17, 512
+RNG = np.random.default_rng(9)
 
 
 def _segments(samples: np.ndarray) -> np.ndarray:
@@ -88,3 +89,19 @@ def test_channels_that_are_not_alike_share_no_rounding() -> None:
         )
         assert not psd.any()
         assert not lacking.any()
+
+
+@pytest.mark.parametrize(
+    ("samples", "step"),
+    [
+        (np.round(RNG.standard_normal(5000), 2) + 9.81, 0.01),
+        (np.round(RNG.standard_normal(5000), 2).astype("f4") + np.float32(9.81), 0.01),
+        ((3000 * RNG.standard_normal(5000)).round() * 2.44e-4, 2.44e-4),
+        ((1e6 + RNG.standard_normal(5000)).astype("f4"), 0.0625),
+        (RNG.standard_normal(5000), np.nan),
+        (RNG.standard_normal(5000).astype("f4"), np.nan),
+        (np.repeat([0.0, 5.0, np.nan], 100), np.nan),
+    ],
+)
+def test_the_step_of_digits_is_found(samples: np.ndarray, step: float) -> None:
+    assert step_of(samples) == pytest.approx(step, rel=1e-3, nan_ok=True)
