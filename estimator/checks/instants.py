@@ -34,14 +34,16 @@ WIDTH = 4.0
 """Highest frequency of a band over that of the next."""
 LEAST_BINS = 26
 """Least frequencies of a band."""
-NOT_WEAK, VERY_LOUD = 4.0, 1000.0
+NOT_WEAK = 4.0
 """Power of what others predict of a channel over what they do not, in a band, from which it is
-compared; and for curves and products: noise in what is predicted bends it beside weak motion."""
+compared."""
+BENT = 3.0
+"""Share of the noise that is a curve or a product, over that of noise in what others predict: it
+bends a curve of what is predicted, where motion is weak or in bursts."""
 CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
 BURSTS = 0.7
-"""By which evidence of play counts less: what leaks at the edges of bursts looks a little like it.
-"""
+"""By which evidence of little play counts less: what leaks at edges of bursts looks like it."""
 PART = 0.4
 """Power that depends on the motion, over the most of any channel, from which a channel is named:
 a third sensor has a quarter of it in what others leave of it."""
@@ -91,6 +93,7 @@ class Dependence:
 
 def dependences(
     spectra: NDArray[np.complexfloating],
+    means: FloatArray,
     frequency: FloatArray,
     window: FloatArray,
     sensor: IntArray,
@@ -103,7 +106,8 @@ def dependences(
     Parameters
     ----------
     spectra : complex, shape (n_segments, n_channels, n_freqs)
-        Of segments times `window`, at all frequencies of the transform.
+        Of segments without their means, times `window`, at all frequencies of the transform.
+    means : float64, shape (n_segments, n_channels)
     frequency : float64, shape (n_freqs,)
         Hz.
     window : float64, shape (segment_length,)
@@ -120,7 +124,7 @@ def dependences(
     for own in _channels(sensor):
         # what others predict: own noise in it would follow itself, where it is in gusts
         motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2)) - rest[own]
-        of_sensor = _Sensor(motion, rest[own], frequency, window)
+        of_sensor = _Sensor(motion, rest[own], means[:, own].T, frequency, window)
         for number, band in enumerate(_bands(frequency, highest)):
             clear = of_sensor.clearest(band, is_highest=number == 0)
             found += [replace(one, channel=int(own[one.channel])) for one in clear]
@@ -190,20 +194,19 @@ class _Sensor:
     Attributes
     ----------
     motion, rest : complex64, shape (n_channels, n_segments, n_freqs)
+    means : float64, shape (n_channels, n_segments)
     frequency : float64, shape (n_freqs,)
     window : float64, shape (segment_length,)
     """
 
     motion: NDArray[np.complex64]
     rest: NDArray[np.complex64]
+    means: FloatArray
     frequency: FloatArray
     window: FloatArray
 
     def clearest(self, own: slice, *, is_highest: bool) -> Iterator[Dependence]:
-        """Yield what is clearest in a band of each channel, if it is clear.
-
-        Curves are looked for in the highest band.
-        """
+        """Yield what is clearest in a band of each channel, if it is clear."""
         felt, left = (np.mean(np.abs(e) ** 2, axis=1) for e in (self.motion, self.rest))
         there = left[:, own].sum(axis=1) / np.maximum(felt[:, own].sum(axis=1), _LEAST)
         tested = np.flatnonzero((left[:, own] > 0).all(axis=1) & (there < 1 / NOT_WEAK))
@@ -216,23 +219,16 @@ class _Sensor:
         x, slope = (course(each, everything) for each in (motion, turn * motion))
         r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
-        (gain, of_gain), (instants, of_instants) = (_of_square(r, each) for each in squares)
-        if r.shape[2] >= PIECE + LASTS:
-            total = np.cumsum(squares[0], axis=2)
-            around = total[..., LASTS:] - total[..., :-LASTS]
-            lasting, of_lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
-            lasts = lasting > np.abs(gain)
-            gain, of_gain = np.where(lasts, [lasting, of_lasting], [gain, of_gain])
-        curve = of_curve = by_product = of_product = spikes = np.zeros(len(tested))
-        if is_highest:
-            steps = np.diff(x, axis=2)  # play follows their sign
-            by_steps, of_steps = _curve(_beside(r[..., 1:], steps), steps)
-            spikes, by_value, stepwise = _of_spikes(r), _curve(r, x), (BURSTS * by_steps, of_steps)
-            curve, of_curve = np.where(stepwise[0] > by_value[0], stepwise, by_value)
-            pairs = itertools.combinations(x, 2)
-            found = [(by_product, of_product), *(_of_product(r, a * b) for a, b in pairs)]
-            by_product, of_product = max(found, key=lambda each: each[0].max())
-            curve, by_product = np.where(there[tested] < 1 / VERY_LOUD, [curve, by_product], 0.0)
+        gain, of_gain = _of_loudness(r, squares[0])
+        instants, of_instants = _of_square(r, squares[1])
+        spikes = _of_spikes(r) if is_highest else np.zeros(len(tested))
+        slopes = np.abs(turn[own]) ** 2
+        of_slope = left[tested, own] @ slopes / np.maximum(felt[tested, own] @ slopes, _LEAST)
+        ratios = there[tested], of_slope
+        bent = [BENT * _bent(*each) for each in zip(ratios, squares, strict=True)]
+        whole = course(motion, slice(0, everything.stop)) + self.means[tested, :, None]
+        curve, of_curve = _clearest_curve(r, whole, bent)
+        by_product, of_product, factors = _clearest_product(r, x, bent[0])
         # all channels of a sensor are sampled at one instant; their residuals are not independent
         instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
         forms: tuple[Form, ...] = ("gain", "instants", "product", "curve", "spikes")
@@ -252,7 +248,13 @@ class _Sensor:
                 scale = np.mean(squares[0][place]) / np.mean(squares[best][place])
                 size = float(np.sqrt(share * there[channel] * scale))
             share = min(abs(share), 1.0)
-            if form == "product" or (size and share < MUCH):
+            clear = np.abs(shares[evidence[:, place] >= CERTAIN, place])
+            if form == "product":
+                alike = course.power(factors[0] * factors[1]) / np.maximum(left[channel], _LEAST)
+                alike *= share / max(float(alike[own].mean()), _LEAST)
+                most = WITHIN_BAND * np.fmin(alike, 1.0) * left[channel]
+                form = "curve" if factors[0] is factors[1] else form
+            elif size and share < MUCH:
                 alike = felt[channel] * size**2 * (1.0 if form == "gain" else np.abs(turn) ** 2)
                 alike = np.maximum(share * left[channel, own].mean(), alike)
                 most = np.minimum(WITHIN_BAND * alike, most)
@@ -263,7 +265,7 @@ class _Sensor:
                 evidence=float(evidence[best, place]),
                 size=size,
                 explained=most.astype(np.float64),
-                power=float(share * there[channel]),
+                power=float(min(clear.max(), 1.0) * there[channel]),
             )
 
 
@@ -278,7 +280,7 @@ class _Courses:
 
     def __init__(self, window: FloatArray, stop: int) -> None:
         self._n = n = min(32 * (int(2.5 * stop) // 32 + 1), len(window))
-        self._middle = slice(n // 4, n - n // 4)
+        self._middle, self._n_freqs = slice(n // 4, n - n // 4), len(window) // 2 + 1
         at = np.arange(n)[self._middle] * (len(window) / n)
         self._window = np.interp(at, np.arange(len(window)), window).astype(np.float32)
         self.edges = np.gradient(self._window) / self._window
@@ -288,6 +290,12 @@ class _Courses:
         padded = np.zeros_like(spectra[..., : some.stop])
         padded[..., some] = spectra[..., some]
         return np.asarray(np.fft.irfft(padded, self._n)[..., self._middle] / self._window)
+
+    def power(self, course: Samples) -> FloatArray:
+        """Return the mean power of courses, (n_segments, n_samples), at the frequencies."""
+        spectrum = np.mean(np.abs(np.fft.rfft(course - course.mean(axis=1, keepdims=True))) ** 2, 0)
+        at = np.arange(self._n_freqs) * (course.shape[1] / self._n)
+        return np.asarray(np.interp(at, np.arange(len(spectrum)), spectrum, right=0.0))
 
 
 def _left(r: Samples, motion: Samples, *edges: Samples) -> Samples:
@@ -324,6 +332,66 @@ def _of_spikes(r: Samples) -> FloatArray:
     few = max(1, round(RARE * power.shape[1]))
     highest = np.partition(power, power.shape[1] - few, axis=1)[:, -few:]
     return np.asarray(highest.sum(axis=1) / np.maximum(power.sum(axis=1), _LEAST))
+
+
+def _bent(ratio: FloatArray, square: Samples) -> FloatArray:
+    """Return the share of noise that motion with noise in it may bend, shape (n_channels,).
+
+    Noise given what it is part of is a curve of that, where this has no normal distribution: at
+    most, in every piece, `ratio` of its power to the mean of `square`, over that of the piece.
+    """
+    n_pieces = square.shape[2] // PIECE
+    pieces = square[..., : n_pieces * PIECE].reshape(len(square), -1, PIECE).mean(axis=2)
+    noise = ratio[:, None] * pieces.mean(axis=1, keepdims=True)
+    return np.asarray(np.mean(np.fmin(noise / np.maximum(pieces, _LEAST), 1.0), axis=1))
+
+
+def _of_loudness(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise whose power follows a square, or its mean around."""
+    found = _of_square(r, square)
+    if r.shape[2] < PIECE + LASTS:
+        return found
+    around = np.cumsum(square, axis=2)
+    around = around[..., LASTS:] - around[..., :-LASTS]
+    lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
+    lasts = lasting[0] > np.abs(found[0])
+    return np.where(lasts, lasting[0], found[0]), np.where(lasts, lasting[1], found[1])
+
+
+def _clearest_curve(
+    r: Samples, x: Samples, least: list[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of a curve of x or, as of play, of its steps: (n_channels,).
+
+    Evidence of what explains all is no larger than that of less: of two that are certain, the
+    curve is the one with the larger share.
+    """
+    steps = np.diff(x, axis=2)
+    by_value, of_value = _clear(_curve(_beside(r, x), x), least[0])
+    by_step, of_step = _clear(_curve(_beside(r[..., 1:], steps), steps), least[1])
+    by_step = np.where(of_step > MUCH, by_step, BURSTS * by_step)
+    certain = np.fmin(by_value, by_step) > CERTAIN
+    stepwise = np.where(certain, of_step > of_value, by_step > by_value)
+    found = np.where(stepwise, [by_step, of_step], [by_value, of_value])
+    return found[0], found[1]
+
+
+def _clearest_product(
+    r: Samples, x: Samples, least: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[Samples, Samples]]:
+    """Return evidence and share of a product of two channels, or a square, and its factors."""
+    pairs = list(itertools.combinations_with_replacement(x, 2))
+    found = [_clear(_of_product(r, first * second), least) for first, second in pairs]
+    clearest = max(range(len(pairs)), key=lambda each: found[each][0].max())
+    return *found[clearest], pairs[clearest]
+
+
+def _clear(
+    found: tuple[FloatArray, FloatArray], least: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share; no evidence where the share is below the least."""
+    evidence, share = found
+    return np.where(share > least, evidence, 0.0), share
 
 
 def _of_product(r: Samples, product: Samples) -> tuple[FloatArray, FloatArray]:
@@ -366,14 +434,15 @@ def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:
     cell = np.clip(8 * x + _CELLS / 2, 0, _CELLS - 1).astype(np.int64)
     cell += _CELLS * np.arange(n_channels * n).reshape(*shape[:2], 1)
     sizes = n_channels, n, _CELLS
-    count, line, sums = (
+    count, sums = (
         np.bincount(cell.ravel(), weights, n_channels * n * _CELLS).reshape(sizes)
-        for weights in (None, x.ravel(), r.ravel())
+        for weights in (None, r.ravel())
     )
     size = np.sqrt(count.sum(axis=1))
     used = size**2 > n
     scale = np.where(used, 1 / np.where(used, size, 1.0), 0.0)
-    basis, _ = np.linalg.qr(np.stack([size * used, line.sum(axis=1) * scale], axis=2))
+    line = size * (np.arange(_CELLS) - (_CELLS - 1) / 2)
+    basis, _ = np.linalg.qr(np.stack([size * used, line * used], axis=2))
     sums = sums * scale[:, None]
     sums -= (sums @ basis) @ basis.swapaxes(1, 2)
     gram = sums @ sums.swapaxes(1, 2)

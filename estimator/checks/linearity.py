@@ -88,16 +88,19 @@ class SquaresAndCubes:
         self._scale: FloatArray | None = None
         self._spectra: list[NDArray[np.complex64]] = []
         self._whole: list[NDArray[np.complex64]] = []
+        self._means: list[FloatArray] = []
+        self._first: FloatArray | float = 0.0
         self._frequencies, self._highest = welch.frequencies, float(self.frequency.max(initial=0))
 
     def add(self, samples: FloatArray) -> None:
         """Add a segment, (segment_length, n_channels), unless it is disturbed."""
-        centred = samples.T - samples.mean(axis=0)[:, None]
+        mean = samples.mean(axis=0)
+        centred = samples.T - mean[:, None]
         size = np.sqrt(np.mean(centred**2, axis=1))
         if not np.all(size > 0) or np.any(np.abs(centred).max(axis=1) > PEAK * size):
             return
         if self._scale is None:
-            self._scale = size
+            self._scale, self._first = size, mean
         x = centred / self._scale[:, None]
         square = x**2
         power = (square @ self._window**2) / (self._window @ self._window)
@@ -107,6 +110,7 @@ class SquaresAndCubes:
         self._spectra.append(spectra[:, :, self.bins].transpose(2, 1, 0))
         if len(self._whole) * spectra[0].size < MOST_VALUES:
             self._whole.append(spectra[0].copy())  # a view would keep squares and cubes
+            self._means.append((mean - self._first) / self._scale)
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
@@ -148,6 +152,7 @@ class SquaresAndCubes:
             return []
         found = dependences(
             np.stack(self._whole),
+            np.stack(self._means),
             self._frequencies,
             self._window,
             sensor,

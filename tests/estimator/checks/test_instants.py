@@ -92,16 +92,27 @@ def test_a_product_of_two_axes_is_in_its_channel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "ratio"), [("play", 60.0), ("play", 38.0), ("steps of a converter", 60.0)]
+    ("kind", "ratio", "size"),
+    [
+        ("play", 60.0, 0.005),
+        ("play", 38.0, 0.005),
+        ("play", 20.0, 0.1),
+        ("steps of a converter", 60.0, 2e-3),
+        ("square of a displacement", 60.0, 2e-3),
+    ],
 )
-def test_what_bends_otherwise_is_a_curve(kind: str, ratio: float) -> None:
+def test_what_bends_otherwise_is_a_curve(kind: str, ratio: float, size: float) -> None:
     """Of play of a tenth of the noise, the sign of the last step tells: no curve of the motion."""
     rng = np.random.default_rng(3)
     sensors = bench(rng, ratio, 3, 3)
-    x = sensors[0][:, 1]
-    sensors[0][:, 1] = with_play(x, 0.005 * x.std())
+    x = sensors[0][:, 1].copy()
+    sensors[0][:, 1] = with_play(x, size * x.std())
     if kind == "steps of a converter":
-        sensors[0][:, 1] = x + 2e-3 * x.std() * np.sin(4 * np.pi * x / x.std())
+        sensors[0][:, 1] = x + size * x.std() * np.sin(4 * np.pi * x / x.std())
+    if kind == "square of a displacement":
+        integral = signal.butter(2, 1.0, "high", fs=RATE, output="sos")
+        far = signal.sosfilt(integral, np.cumsum(signal.sosfilt(integral, np.cumsum(x))))
+        sensors[0][:, 1] = x + size * x.std() * far**2 / far.var()
     found = dependences(rng, sensors)
     assert {(each.channel, each.form) for each in found} == {(1, "curve")}
     assert not found[0].size
@@ -121,15 +132,20 @@ def test_a_channel_that_is_too_slow_for_most_of_its_motion_is_found(most: float)
     assert {each.channel for each in dependences(rng, sensors)} == {3}
 
 
-def test_play_beside_red_motion_is_found() -> None:
-    """Its noise is above the motion at most frequencies, and far below all of the motion."""
+@pytest.mark.parametrize(("kind", "slope"), [("play", -1.5), ("dead zone", -1.0)])
+def test_play_or_a_dead_zone_beside_red_motion_is_found(kind: str, slope: float) -> None:
+    """Noise of play is above the motion at most frequencies, and far below all of the motion.
+
+    A dead zone is at 0, which the mean of a segment moves.
+    """
     rng = np.random.default_rng(17)
     frequency = np.maximum(np.fft.rfftfreq(N_SAMPLES, 1 / RATE), 0.05)[:, None]
     sensors = [
-        np.fft.irfft(np.fft.rfft(each, axis=0) * (frequency / 5) ** -1.5, axis=0)
+        np.fft.irfft(np.fft.rfft(each, axis=0) * (frequency / 5) ** slope, axis=0)
         for each in bench(rng, 50.0, 3, 3)
     ]
-    sensors[1][:, 0] = with_play(sensors[1][:, 0], 0.05 * float(sensors[1][:, 0].std()))
+    x, size = sensors[1][:, 0].copy(), 0.05 * float(sensors[1][:, 0].std())
+    sensors[1][:, 0] = with_play(x, size) if kind == "play" else x - np.clip(x, -size, size)
     assert {each.channel for each in dependences(rng, sensors)} == {3}
 
 
