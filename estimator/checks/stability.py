@@ -55,6 +55,8 @@ LEAST_LEFT = 0.02
 """Share of the noise that gains add which change from segment to segment, to be named."""
 DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
+FEW = 10.0
+"""Over the averages of a part, by how much its scores scatter more where the noise changes."""
 SECOND_ORDER = 4.0
 """Times the variance of a response between parts, a change is at most, squared. Scores are linear
 in changes: the share of its statistic that may look like changes of other sensors."""
@@ -410,7 +412,14 @@ def stability(
     )
     suspect = bool(explained.any())
     levels = [None if band is None else band.levels for band in bands]
-    changes, added = _changed(bands, dims, begin, end, doubtful=doubtful and suspect)
+    changes, added = _changed(
+        bands,
+        dims,
+        begin,
+        end,
+        least=min(float(averages[some].sum()) for some in groups),
+        doubtful=doubtful and suspect,
+    )
     low, high = np.array([frequency[inside][[0, -1]] for inside in insides]).T
     if suspect and not doubtful:
         changes, added = _also_by_band(
@@ -611,6 +620,7 @@ def _changed(
     begin: FloatArray,
     end: FloatArray,
     *,
+    least: float,
     doubtful: bool,
 ) -> tuple[tuple[ResponseChange, ...], FloatArray]:
     """Return the responses that change, and what this adds as a fraction of the motion's PSD.
@@ -618,10 +628,11 @@ def _changed(
     The fraction has the shape (n_channels,).
 
     Noise that changes, in any channel, scatters the scores more: they are weighted by the part's
-    loudest channel where the noise of the band is not steady. Where the noise is `doubtful`, it is
-    a scale but for a factor.
+    loudest channel where the noise of the band is not steady, beside what such noise adds on
+    average; with the `least` averages of a part, this is known to first order. Where the noise is
+    `doubtful`, it is a scale but for a factor.
     """
-    n_parts, is_weighted = len(begin), False
+    n_parts, doubt = len(begin), DOUBT if doubtful else 1.0
     found = []
     for band in bands:
         if band is None or band.responses is None or (band.levels is None and not doubtful):
@@ -635,12 +646,12 @@ def _changed(
             if unsteady.any():
                 level = np.maximum(1.0, band.levels.level[:, unsteady].max(axis=1))
                 responses = responses.beside_noise(unsteady).weighted(level)
-                is_weighted = True
+                doubt = max(doubt, 1 + FEW / least)
         found.append(responses)
     if not found:
         return (), np.zeros(sum(dims))
     total = functools.reduce(operator.add, found)
-    if is_weighted:  # the mean of others is zero
+    if doubt > 1 and not doubtful:  # the mean of others is zero
         total = total.centred()
     added = np.zeros(sum(dims))
     first = np.cumsum([0, *dims])
@@ -656,7 +667,7 @@ def _changed(
         for sensor in sorted(left, key=strength.__getitem__, reverse=True):
             chi, df = tests[sensor]
             most = critical_value(df, FALSE_ALARM / len(dims)) if df > 0 else math.inf
-            most = (DOUBT if doubtful else 1.0) * most + second_order
+            most = doubt * most + second_order
             if chi > most and chi > most + total.leaked(sensor, taken):
                 break
         else:

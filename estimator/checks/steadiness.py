@@ -72,8 +72,6 @@ class Regression:
         ``n_k U* S_k U``.
     of_motion : complex128, of the same shape
         Inverse of `motion`.
-    beside : float64, shape (n_parts, n_bins, n_channels)
-        Diagonal of ``P S_k P``.
     directions : complex128, shape (n_bins, n_channels, n_factors)
         U.
     projector : complex128, shape (n_bins, n_channels, n_channels)
@@ -92,7 +90,6 @@ class Regression:
     along: ComplexArray
     motion: ComplexArray
     of_motion: ComplexArray
-    beside: FloatArray
     directions: ComplexArray
     projector: ComplexArray
     averages: FloatArray
@@ -194,9 +191,9 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
     across = (across + across.conj().swapaxes(2, 3)) / 2
     beside = at.projector
     PS = beside @ S  # beside has more digits than 1 - U U*, where a channel is nearly motion
-    PSU, PSP, of_motion = PS @ U, PS @ beside, np.linalg.inv(across)
+    PSU, of_motion = PS @ U, np.linalg.inv(across)
     D = PSU @ of_motion
-    left = PSP - D @ PSU.conj().swapaxes(2, 3)
+    left = PS @ beside - D @ PSU.conj().swapaxes(2, 3)
     covariance = left.real * (n / (n - q))[:, None, None, None]
     inverse = fisher.covariance(np.abs(beside) ** 2)
     excess = np.einsum("kfpp->kfp", covariance) - np.einsum("fpp->fp", beside).real
@@ -209,7 +206,6 @@ def regression(parts: Divided, at: Maximum, psd: FloatArray) -> Regression:
         along=n[:, None, None, None] * PSU,
         motion=n[:, None, None, None] * across,
         of_motion=np.asarray(of_motion / n[:, None, None, None]),
-        beside=np.einsum("kfpp->kfp", PSP).real,
         directions=U,
         projector=beside,
         averages=n - q,
@@ -266,9 +262,10 @@ class _Piece:
         Of responses per bin, by the scales.
     motion : complex128, shape (n_parts, n_bins, n_factors, n_factors)
     noise : float64, shape (n_parts, n_channels)
-        Noise of ``P S_k P`` less that of the fit, times the averages: mean over frequencies.
-    weight : float64, shape (n_parts,)
-        Of its scores.
+        Noise less that of the fit: mean over frequencies.
+    weight, averages : float64, shape (n_parts,)
+        Of its scores, and of the parts.
+    scale : float64, shape (n_bins, n_channels)
     """
 
     beside: ComplexArray
@@ -277,6 +274,8 @@ class _Piece:
     motion: ComplexArray
     noise: FloatArray
     weight: FloatArray
+    averages: FloatArray
+    scale: FloatArray
 
     def information(self, one: slice, others: Sequence[slice]) -> FloatArray:
         """Return that of a sensor's channels and neighbours', (n_parts, d*d, sum of their d*d)."""
@@ -298,21 +297,33 @@ class _Piece:
 
     def scores(self, change: FloatArray) -> FloatArray:
         """Return the scores of a change, (n_channels, n_channels) in and (n_parts, ...) out."""
-        X = (self.beside @ change @ self.along @ self.motion).swapaxes(1, 2)
-        across = self.along.swapaxes(0, 1).reshape(len(change), -1).conj().T
-        found = (X.reshape(-1, len(across)) @ across).real.reshape(len(X), *change.shape)
-        return np.asarray(self.weight[:, None, None] * found)
+        return self._of(self.beside @ change @ self.along @ self.motion).real
 
     def leaks(self) -> ComplexArray:
         """Return scores of leakage as by slopes, (n_parts, n_channels, n_channels)."""
+        return self._of(self.slopes @ self.motion)
+
+    def _of(self, X: ComplexArray) -> ComplexArray:
         along = self.along.swapaxes(0, 1).reshape(self.along.shape[1], -1).conj().T
-        X = (self.slopes @ self.motion).swapaxes(1, 2).reshape(len(self.motion), -1, len(along))
+        X = X.swapaxes(1, 2).reshape(len(X), -1, len(along))
         return np.asarray(self.weight[:, None, None] * (X @ along))
 
-    def by_noise(self, a: IntArray, b: IntArray) -> FloatArray:
-        """Return scores of ``to, from`` by the noise of channels, shape (n_pairs, n_channels)."""
-        UU = self.along @ self.along.conj().swapaxes(1, 2)
-        return np.asarray((self.beside[:, a] * UU[:, :, b].swapaxes(1, 2)).real.sum(axis=0))
+    def by_noise(self, noise: FloatArray, a: IntArray, b: IntArray) -> FloatArray:
+        """Return scores of ``to, from`` by noise less that of the fit, (n_parts, n_channels) in.
+
+        Of shape (n_parts, n_pairs): that of ``n_k P N_k U``; and as the directions follow scatter,
+        they are off by ``E = P C M**-1``, of the sums of products C with the motion and M of the
+        motion, which makes the mean of the scores that of ``(C_k - E M_k) E*``.
+        """
+        P, UU = self.beside, self.along @ self.along.conj().swapaxes(1, 2)
+        by_one = (P[:, a] * UU[:, :, b].swapaxes(1, 2)).real.sum(axis=0)
+        share = np.linalg.inv(self.motion.sum(axis=0)) @ self.motion
+        own = np.einsum("kfaa->kf", share).real[:, :, None] * noise[:, None]
+        own -= np.einsum("jfab,kfba,jp->kfp", share, share, noise, optimize=True).real
+        square = self.scale[:, b, None] * self.scale[:, None]
+        off = (P[:, a] * P[:, b].conj()).real / square**2
+        found = (self.averages[:, None] * noise) @ by_one.T + np.einsum("kfp,fip->ki", own, off)
+        return np.asarray(self.weight[:, None] * found)
 
 
 class ResponseScores:
@@ -361,15 +372,12 @@ class ResponseScores:
         beside, along = P * (s[:, :, None] * s[:, None, :]), found.directions / s[:, :, None]
         slopes = s[:, :, None] * slopes
         scores = (s[:, :, None] * found.beside_fit()).swapaxes(1, 2)
-        excess = found.beside - np.einsum("fpp->fp", P).real
-        noise = (found.inverse @ excess[..., None])[..., 0]
         (to, of), sensors = _within(dims), _sensors(dims)
         every = []
         for some, more in pieces:
-            own_noise = n[:, None] * noise[:, some].sum(axis=1) / (some.stop - some.start)
-            weight = np.full(len(n), 2 / more)
-            motion = found.motion[:, some]
-            piece = _Piece(beside[some], along[some], slopes[some], motion, own_noise, weight)
+            weight, noise = np.full(len(n), 2 / more), found.noise[:, some].mean(axis=1)
+            motion, parts = found.motion[:, some], (beside[some], along[some], slopes[some])
+            piece = _Piece(*parts, motion, noise, weight, n, s[some])
             across = piece.along.swapaxes(0, 1).reshape(len(s.T), -1).conj().T
             score = (scores[:, :, some].reshape(-1, len(across)) @ across).real
             own = [piece.information(each, [each]) for each in sensors]
@@ -406,15 +414,13 @@ class ResponseScores:
     def beside_noise(self, channels: BoolArray) -> ResponseScores:
         """Return the scores without what noise of some channels adds that is not that of the fit.
 
-        It is ``n_k P N_k U``, zero where N_k is the unit matrix, and as much of the score as a
-        response that changes where motion is weak. The noise of a part is that of ``P S_k P``,
-        which is unbiased if no response changes.
+        It is as much as a response that changes where motion is weak.
         """
         score, size = self.score.copy(), sum(len(each.along) for each in self._pieces)
         total = sum(len(each.along) * each.noise for each in self._pieces) / size
         noise = np.where(channels, total, 0.0)
         for each in self._pieces:
-            score -= each.weight[:, None] * (noise @ each.by_noise(*_within(self.dims)).T)
+            score -= each.by_noise(noise, *_within(self.dims))
         return ResponseScores(self.dims, score, self._own, self._pieces)
 
     def weighted(self, level: FloatArray) -> ResponseScores:

@@ -19,10 +19,10 @@ from estimator.checks.shared_motion import (
 )
 from estimator.checks.stability import Scatter, Stability
 from estimator.checks.steadied import Steadied
-from estimator.checks.steadiness import ResponseChange, slopes_of
+from estimator.checks.steadiness import ResponseChange, ResponseScores, regression, slopes_of
 from estimator.likelihood.factor_analysis import maximise
 from estimator.likelihood.goodness_of_fit import neighbour_correlation
-from estimator.spectra.parts import MOST, PartEnds, Parts, part_bins
+from estimator.spectra.parts import MOST, Divided, PartEnds, Parts, part_bins
 from estimator.spectra.welch import (
     MAX_SEGMENTS,
     MAX_VALUES,
@@ -220,6 +220,27 @@ def test_noise_of_one_sensor_that_changes_beside_weak_motion_is_no_gain(seed: in
     assert found.stability is not None
     assert not found.stability.changes
     assert [each.sensors for each in found.advice if isinstance(each, NoiseChanges)] == [(2,)]
+
+
+@pytest.mark.parametrize("loud", [8.0, 3.0])
+def test_noise_that_changes_is_no_response_that_changes_in_few_averages(
+    loud: float,
+) -> None:
+    """Chi-squared of 18 degrees; directions that follow the loudest noise add 140 and 50 to it."""
+    rng, n = np.random.default_rng(5), 14
+    directions = 10**0.5 * np.concatenate([rotation(rng, 3) for _ in DIMS])
+    noise = np.array([np.where(np.arange(9) // 3 == 1, level, 1.0) for level in (loud, 0.5, 0.5)])
+    csm = []
+    for level in noise:
+        samples = white(rng, 2000, n, 3) @ directions.T + white(rng, 2000, n, 9) * np.sqrt(level)
+        csm.append(samples.swapaxes(1, 2) @ samples.conj() / n)
+    fit = maximise(np.mean(csm, axis=0), 3)
+    psd = np.einsum("fii->fi", np.mean(csm, axis=0)).real
+    found = regression(Divided(np.array(csm), np.full(3, float(n))), fit, psd)
+    (scores,) = ResponseScores.of(found, DIMS, [(slice(0, 2000), 1.0)], 0 * found.directions)
+    changing = scores.beside_noise(noise[0] != 1).weighted(noise.max(axis=1)).centred()
+    assert scores.test(1)[0] > 1000
+    assert changing.test(1)[0] < 18 + 5 * 36**0.5
 
 
 def test_kept_segments_are_bounded_in_number() -> None:
