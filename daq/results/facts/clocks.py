@@ -310,13 +310,7 @@ def facts_of_clocks(estimate: Estimate) -> Iterator[Fact]:
                 slips=tuple(clock.slips),
                 time_utc_ns=(clock.slips[0].utc_ns, clock.slips[-1].utc_ns),
             )
-        if not clock.is_understood:
-            yield ClockNotUnderstood(
-                rank=Rank.INVALIDATES,
-                sensors=(clock.sensor,),
-                ppm=clock.ppm,
-                error=clock.residual,
-            )
+    yield from _not_understood(estimate)
     yield from _polled(estimate)
     if nominal := tuple(clock.sensor for clock in clocks if math.isnan(clock.residual)):
         yield RatesNominal(rank=Rank.DELAYS, sensors=nominal)
@@ -326,6 +320,23 @@ def facts_of_clocks(estimate: Estimate) -> Iterator[Fact]:
         if loose:
             yield ClocksMayExplain(
                 rank=Rank.DELAYS, sensors=tuple(loose), error=max(loose.values())
+            )
+
+
+def _not_understood(estimate: Estimate) -> Iterator[ClockNotUnderstood]:
+    """Yield clocks on which no delays lie: the reference's, where those of all others are not."""
+    clocks, against = estimate.snapshot.clocks, reference(estimate.snapshot)
+    off = {clock.sensor: clock.residual for clock in clocks if not clock.is_understood}
+    others = [residual for sensor, residual in off.items() if sensor != against]
+    if against is not None and 1 < len(others) == len(clocks) - 1:
+        off = {against: min(others)}
+    for clock in clocks:
+        if clock.sensor in off:
+            yield ClockNotUnderstood(
+                rank=Rank.INVALIDATES,
+                sensors=(clock.sensor,),
+                ppm=clock.ppm,
+                error=off[clock.sensor],
             )
 
 
