@@ -39,7 +39,6 @@ from daq.estimation.equalisation import (
     ROUNDS,
     Equalisation,
 )
-from daq.estimation.freed_memory import reused
 from daq.estimation.noise_estimates import Dimensions, averages
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -493,7 +492,7 @@ def estimate(
     NoResultError
         If there is too little for any of the methods.
     """
-    with reused(), Estimation(paths, settings, jobs=jobs) as estimation:
+    with Estimation(paths, settings, jobs=jobs) as estimation:
         snapshot = estimation.finish(progress)
         del estimation
     return snapshot

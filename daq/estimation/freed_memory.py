@@ -4,43 +4,22 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 
 LARGE = 1 << 21
-"""Size in bytes from which an array gets a mapping of its own, but within an estimate. Mappings
-cost system time. Live estimate of 2 h of three triaxial sensors: 2 s without mappings, 8 s with
-this limit, 14 s with 128 kB; the peaks are 237, 187 and 181 MB. Its arrays are smaller."""
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # of malloc.h
+"""Size in bytes from which an array of a live estimate gets a mapping of its own. Mappings cost
+system time. Live estimate of 2 h of three triaxial sensors: 2 s without mappings, 8 s with this
+limit, 14 s with 128 kB; the peaks are 237, 187 and 181 MB. Its arrays are smaller."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
-def limit(*, mapped: int = LARGE, mappings: int = 1 << 16, returned: int = 1 << 17) -> None:
-    """Set the bytes of an array that gets a mapping of its own, and of free memory not to keep.
-
-    And the number of such `mappings`, at most.
-    """
+def limit() -> None:
+    """Give arrays from `LARGE` on mappings of their own, and keep little freed memory."""
     option = c_function("mallopt", ctypes.c_int, ctypes.c_int)
     if option is not None:
-        option(_M_MMAP_THRESHOLD, mapped)
-        option(_M_MMAP_MAX, mappings)
-        option(_M_TRIM_THRESHOLD, returned)
-
-
-@contextmanager
-def reused() -> Generator[None]:
-    """Make new arrays in the memory of freed ones, and give it back at the end.
-
-    Fresh pages take a seventh of the processor time of an estimate of hours, and a fourth with
-    rejection. Its peak is 50 MB higher. Matrices of many channels are larger than any limit of
-    mappings may be: there are none.
-    """
-    limit(mappings=0, returned=1 << 29)
-    try:
-        yield
-    finally:
-        limit()
-        give_back()
+        option(_M_MMAP_THRESHOLD, LARGE)
+        option(_M_TRIM_THRESHOLD, 1 << 17)
 
 
 def give_back() -> None:

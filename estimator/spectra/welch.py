@@ -25,6 +25,7 @@ from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SEGMENTS_PER_BLOCK = 32
 BLOCK_VALUES = 2**20  # maximum number of values per group: 8 MB
+TAPERED_VALUES = 2**17  # maximum number of values that are transformed at a time: 1 MB
 FREQUENCIES_PER_BLOCK = 512
 PRODUCT_VALUES = 2**19  # maximum number of values of products of channels at a time: 4 MB
 KEPT_VALUES = 10**7  # maximum number of values of products that are kept: 80 MB
@@ -134,10 +135,9 @@ class CrossSpectra:
         n_freqs = settings.segment_length // 2 + 1
         self._shape = n_freqs, n_channels
         self._products = _Products(*self._shape)
-        self._work = _Work()
+        self._work = Work()
         self._block = max(1, min(SEGMENTS_PER_BLOCK, BLOCK_VALUES // (n_channels * length)))
-        # One value per sample and channel: contiguous products are several times faster in numpy.
-        self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
+        self._taper = np.empty((0, n_channels))
         self._tapers = bool(np.any(self._window != 1))
         # Trends are fitted to the samples and subtracted from their spectra, where they fill few
         # bins.
@@ -244,13 +244,16 @@ class CrossSpectra:
                 f"segments begin at rows {starts.min()} to {starts.max()}, expected 0 to {last}"
             )
 
-    def transforms(self, samples: FloatArray, starts: IntArray) -> ComplexArray:
+    def transforms(
+        self, samples: FloatArray, starts: IntArray, work: Work | None = None
+    ) -> ComplexArray:
         """Return the spectra of segments as `add_spectra` takes them; threads may call it.
 
-        Parameters are those of `add`.
+        `samples` and `starts` are those of `add`; what is returned is in the memory of `work`.
         """
-        found = np.empty((len(starts), *self._shape), np.complex128)
-        for _ in self._transformed(samples, starts, _Work(), found):
+        work = Work() if work is None else work
+        found = work.spectra(len(starts), *self._shape)
+        for _ in self._transformed(samples, starts, work, found):
             pass
         return found
 
@@ -258,15 +261,20 @@ class CrossSpectra:
         self,
         samples: FloatArray,
         starts: IntArray,
-        work: _Work,
+        work: Work,
         found: ComplexArray | None = None,
     ) -> Iterator[ComplexArray]:
         """Yield the spectra of some segments at a time: parts of `found`, or the same memory."""
         length, n_channels = self.settings.segment_length, self.n_channels
-        block = max(1, min(self._block, len(starts)))
+        block = self._block if found is None else TAPERED_VALUES // (n_channels * length)
+        block = max(1, min(block, len(starts)))
         by_channel = samples.strides[0] == samples.itemsize  # channel after channel in memory
+        if not (by_channel or len(self._taper)):
+            # One value per sample and channel: contiguous products are several times faster.
+            self._taper = np.repeat(self._window[:, None], n_channels, axis=1)
         taper = self._window[:, None] if by_channel else self._taper
-        frames, at_work = work.of(block, length, n_channels, by_channel=by_channel)
+        frames = work.frames(block, length, n_channels, by_channel=by_channel)
+        at_work = work.spectra(block, *self._shape) if found is None else found
         trend = np.empty((block, len(self._fit), n_channels))
         for first in range(0, len(starts), block):
             rows = starts[first : first + block]
@@ -275,7 +283,7 @@ class CrossSpectra:
             np.matmul(self._fit, segments, out=trend[:n])
             if self._tapers:
                 segments = np.multiply(segments, taper, out=frames[:n])
-            spectra = at_work[:n] if found is None else found[first : first + n]
+            spectra = at_work[:n] if found is None else at_work[first : first + n]
             np.fft.rfft(segments, axis=1, out=spectra)
             spectra[:, self._trend_bins] -= self._trend_spectra @ trend[:n]
             yield spectra
@@ -349,7 +357,7 @@ class CrossSpectra:
         if self.n_segments == 0:
             raise InsufficientDataError("no segment yet; expected at least one")
         density = self._density(self.n_segments)
-        self._work = _Work()  # whoever asks for the sum is rarely about to add more
+        self._work = Work()
         csm = self._products.total()
         csm *= density[:, None, None]
         return csm
@@ -371,28 +379,29 @@ class CrossSpectra:
         return total
 
 
-class _Work:
-    """Tapered segments and spectra of one group: memory that is not taken afresh for each."""
+class Work:
+    """Tapered segments and spectra: memory that is not taken afresh for each group or piece."""
 
     def __init__(self) -> None:
         self._frames, self._spectra = np.empty(0), np.empty(0, dtype=np.complex128)
 
-    def of(
+    def frames(
         self, n_segments: int, length: int, n_channels: int, *, by_channel: bool
-    ) -> tuple[FloatArray, ComplexArray]:
-        """Return arrays (n_segments, length, n_channels) and (n_segments, n_freqs, n_channels)."""
-        n_frames = n_segments * length * n_channels
-        n_spectra = n_segments * (length // 2 + 1) * n_channels
-        if len(self._frames) < n_frames:
-            self._frames = np.empty(n_frames)
-            self._spectra = np.empty(n_spectra, dtype=np.complex128)
-        frames, spectra = self._frames[:n_frames], self._spectra[:n_spectra]
+    ) -> FloatArray:
+        """Return an array (n_segments, length, n_channels), whose memory may be by channel."""
+        size = n_segments * length * n_channels
+        if len(self._frames) < size:
+            self._frames = np.empty(size)
         inner = (n_channels, length) if by_channel else (length, n_channels)
-        shaped = frames.reshape(n_segments, *inner)
-        return (
-            shaped.swapaxes(1, 2) if by_channel else shaped,
-            spectra.reshape(n_segments, -1, n_channels),
-        )
+        shaped = self._frames[:size].reshape(n_segments, *inner)
+        return shaped.swapaxes(1, 2) if by_channel else shaped
+
+    def spectra(self, n_segments: int, n_freqs: int, n_channels: int) -> ComplexArray:
+        """Return an array (n_segments, n_freqs, n_channels)."""
+        size = n_segments * n_freqs * n_channels
+        if len(self._spectra) < size:
+            self._spectra = np.empty(size, dtype=np.complex128)
+        return self._spectra[:size].reshape(n_segments, n_freqs, n_channels)
 
 
 class _Products:
@@ -408,7 +417,8 @@ class _Products:
     def __init__(self, n_freqs: int, n_channels: int) -> None:
         n_parts = 2 * n_channels
         self._total = np.zeros((n_freqs, n_channels, n_channels))
-        self._gram: FloatArray | None = None
+        self._gram = np.empty(0)
+        self._has_gram = False
         self._waiting: list[ComplexArray] = []
         self.gram_shape = n_freqs, n_parts, n_parts
         self.is_small = math.prod(self.gram_shape) <= KEPT_VALUES
@@ -442,9 +452,13 @@ class _Products:
 
     def add_gram(self, gram: FloatArray) -> None:
         """Add segments by what `gram` returned of them."""
-        if self._gram is None:
-            self._gram = np.zeros_like(gram)
-        self._gram += gram
+        if self._has_gram:
+            self._gram += gram
+        elif len(self._gram):
+            self._gram[:] = gram
+        else:
+            self._gram = gram.copy()
+        self._has_gram = True
 
     def _add_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
@@ -456,10 +470,9 @@ class _Products:
 
     def _settle(self) -> None:
         """Add what waits, and what is kept in another form."""
-        if self._gram is not None:
-            for some in self._pieces:
-                _add_gram(self._total[some], self._gram[some])
-            self._gram = None
+        for some in self._pieces if self._has_gram else ():
+            _add_gram(self._total[some], self._gram[some])
+        self._has_gram = False
         self._add_waiting()
 
     def packed(self) -> FloatArray:
@@ -470,6 +483,7 @@ class _Products:
     def total(self) -> ComplexArray:
         """Return the sum in an array of its own, (n_freqs, n_channels, n_channels)."""
         self._settle()
+        self._gram = np.empty(0)  # whoever asks for the sum is rarely about to add more
         found = np.empty(self._total.shape, dtype=np.complex128)
         for some in self._pieces:
             found[some] = unpacked(self._total[some])

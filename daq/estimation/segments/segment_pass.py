@@ -38,6 +38,7 @@ from estimator.spectra.welch import (
     CrossSpectra,
     SegmentSpectra,
     WelchSettings,
+    Work,
     kept_bins,
 )
 from estimator.spectra.windows import (
@@ -73,7 +74,7 @@ _Span = tuple[int, int]
 _NEAR = 0.05  # samples by which a stretch may begin or end later: fitted clocks are off by some µs
 _Read = TypeVar("_Read")
 
-_READERS = 2  # pieces being read while one is worked on
+_READERS = 2  # pieces being read while one is worked on: no more than that exist, with this one
 
 
 def read_ahead(read: Callable[[_Piece], _Read], pieces: Sequence[_Piece]) -> Generator[_Read]:
@@ -420,9 +421,10 @@ class Pass:
 
         on_grid = self._is_on_grid
 
-        def read(piece: _Span, room: _Sums | None = None) -> _Samples | OwnSpectra:
+        def read(
+            piece: _Span, out: FloatArray | None = None, work: Work | None = None
+        ) -> _Samples | OwnSpectra:
             first, count = piece
-            out = None if room is None else room.products
             if source is self.aligned and not on_grid:
                 found = self._own_spectra((first + np.arange(count)) * hop)
                 if found is not None:
@@ -432,10 +434,18 @@ class Pass:
             if live or not is_small or self.octaves is not None or self._undisturbed is not None:
                 return part
             # in this thread: the one that adds them is waited for
-            spectra = self._all.transforms(part.samples, np.arange(count) * hop)
+            spectra = self._all.transforms(part.samples, np.arange(count) * hop, work)
             return replace(part, spectra=spectra, products=self._products(spectra, first, out))
 
-        coming: Generator[_Samples | OwnSpectra | _Sums] = read_ahead(read, pieces)
+        shape = self._all.products_shape
+        rooms = [(np.empty(shape) if shape else None, Work()) for _ in range(_READERS + 1)]
+
+        def summed(numbered: tuple[int, _Span]) -> _Samples | OwnSpectra | _Sums:
+            number, piece = numbered
+            part = read(piece, *rooms[number % len(rooms)])
+            return self._summed(part, *piece) or part
+
+        coming: Generator[_Samples | OwnSpectra | _Sums] = read_ahead(summed, [*enumerate(pieces)])
         if not live and self._is_shared(pieces):
             coming = self._read_by_forks(read, pieces)
         with closing(coming):
@@ -468,7 +478,7 @@ class Pass:
 
     def _read_by_forks(
         self,
-        read: Callable[[_Span, _Sums | None], _Samples | OwnSpectra],
+        read: Callable[[_Span, FloatArray | None], _Samples | OwnSpectra],
         pieces: Sequence[_Span],
     ) -> Generator[_Samples | OwnSpectra | _Sums]:
         """Yield the sums of pieces from other processes; what has gaps or is left out is read here.
@@ -489,10 +499,12 @@ class Pass:
 
         def work(piece: _Span, room: _Sums) -> bool:
             n_damaged = sum(sensor.n_damaged for sensor in self._sensors)
-            part = read(piece, room)
-            is_intact = n_damaged == sum(sensor.n_damaged for sensor in self._sensors)
-            # else the other process is to count the damage, too
-            return is_intact and self._summed(part, *piece, room)
+            sums = self._summed(read(piece, room.products), *piece)
+            if sums is None or n_damaged != sum(sensor.n_damaged for sensor in self._sensors):
+                return False  # the other process is to count the damage, too
+            room.single[: len(sums.single)], room.still[:] = sums.single, sums.still
+            room.picked[: len(sums.picked)] = sums.picked
+            return True
 
         for sensor in self._sensors:
             sensor.locate()  # once, for all processes
@@ -501,29 +513,32 @@ class Pass:
         for piece, sums in zip(pieces, found, strict=True):
             yield read(piece, None) if sums is None else sums
 
-    def _summed(self, part: _Samples | OwnSpectra, first: int, count: int, room: _Sums) -> bool:
-        """Put into a room what a piece adds; return False where segments may be left out."""
+    def _summed(self, part: _Samples | OwnSpectra, first: int, count: int) -> _Sums | None:
+        """Return what a piece adds, without all its spectra; None where segments may be left out.
+
+        Threads may call it.
+        """
         hop = self.welch.hop
         if part.spectra is None or part.products is None:
-            return False
+            return None
+        picked = part.spectra[:0]
         if isinstance(part, OwnSpectra):
             n_samples = (count - 1) * hop + self.welch.segment_length
             kept = self._kept(first * hop, len(part.raw))
             is_whole = self._unwanted(first * hop, n_samples) is None
-            picked = part.spectra[_is_picked(first + np.arange(count), self._every, again=True)]
-            is_whole &= len(picked) <= len(room.picked)
-            room.picked[: len(picked)] = picked[: len(room.picked)]
+            if self._delays.measures:
+                numbers = first + np.arange(count)
+                picked = part.spectra[_is_picked(numbers, self._every, again=True)]
         else:
             kept = part.raw_kept
             is_whole = part.unwanted is None and bool(part.usable.all())
             is_whole &= not self._delays.measures
         if not is_whole:
-            return False
+            return None
         stillness = FlatlineDetector(hop, self.n_channels, self.welch.sampling_rate)
         stillness.add(part.raw, kept)
-        room.still[:] = stillness.counts
-        room.single[:count] = part.spectra[:, self.single.bins]
-        return True
+        single = part.spectra[:, self.single.bins].astype(np.complex64)
+        return _Sums(part.products, single, picked, stillness.counts)
 
     def _take_sums(self, part: _Sums, first: int, count: int) -> None:
         """Add whole segments by their sums; `first` is the number of the first of them."""

@@ -72,7 +72,7 @@ def _compare(path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch, jo
     rows: list[NDArray[Any]]
 
     def counted(self: Pass, part: Any, first: int, count: int) -> None:  # noqa: ANN401
-        counts.append(count)
+        counts.append(count if number > 1 else 0)
         take(self, part, first, count)
 
     monkeypatch.setattr(Pass, "_take_sums", counted)

@@ -45,30 +45,6 @@ def test_freed_arrays_go_back_to_the_system_while_small_ones_stay() -> None:
     assert float(python(_AFTER_MANY_ARRAYS).stdout) < 20.0
 
 
-_ARRAYS_AGAIN = """
-import numpy as np
-from resource import RUSAGE_SELF, getrusage
-from daq.estimation.freed_memory import reused
-
-def faults() -> int:
-    before = getrusage(RUSAGE_SELF).ru_minflt
-    for _ in range(20):
-        np.ones(2_000_000), np.ones(5_000_000)
-    return getrusage(RUSAGE_SELF).ru_minflt - before
-
-with reused():
-    print(faults() * 0 + faults())
-print(faults())
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="its C library may keep no memory")
-def test_an_estimate_makes_arrays_in_the_memory_of_freed_ones() -> None:
-    again, later = map(int, python(_ARRAYS_AGAIN).stdout.split())
-    pages = 20 * 56_000_000 // 4096
-    assert again < pages / 100 < pages / 20 < later  # some pages are large ones
-
-
 def test_segments_are_divided_without_a_copy_of_all_residuals() -> None:
     rng = np.random.default_rng(0)
     n_segments, n_kept, p = 1000, 48, 9

@@ -232,7 +232,7 @@ def test_products_of_pieces_are_those_that_are_added(
 ) -> None:
     monkeypatch.setattr(segment_pass, "_VALUES_AT_ONCE", 3 * 9 * HOP)
     made, used = [], []
-    products, add = CrossSpectra.products, CrossSpectra.add_spectra
+    products, add = CrossSpectra.products, CrossSpectra.add_products
 
     def noted(self: CrossSpectra, spectra: np.ndarray, _out: object) -> np.ndarray | None:
         found = products(self, spectra)
@@ -240,13 +240,13 @@ def test_products_of_pieces_are_those_that_are_added(
         return found
 
     def added(
-        self: CrossSpectra, spectra: np.ndarray, of: np.ndarray | None, *, places: np.ndarray
+        self: CrossSpectra, of: np.ndarray, single: np.ndarray, *, places: np.ndarray
     ) -> None:
         used.append(of)
-        add(self, spectra, of, places=places)
+        add(self, of, single, places=places)
 
     monkeypatch.setattr(CrossSpectra, "products", noted)
-    monkeypatch.setattr(CrossSpectra, "add_spectra", added)
+    monkeypatch.setattr(CrossSpectra, "add_products", added)
     with Recording.open(recording) as opened:
         one = Pass(opened, PIECES)
         one.aligned.refresh()
