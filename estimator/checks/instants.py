@@ -449,8 +449,8 @@ def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:
     own = np.einsum("css->cs", gram)
     total, expected = gram.sum(axis=(1, 2)), own.sum(axis=1)
     variance = 2 * (np.sum(gram**2, axis=(1, 2)) - np.sum(own**2, axis=1))
-    spread = variance / (9 * expected**2)  # of the cube root (Wilson and Hilferty)
     with np.errstate(invalid="ignore", divide="ignore"):
+        spread = variance / (9 * expected**2)  # of the cube root (Wilson and Hilferty)
         evidence = (np.cbrt(total / expected) - (1 - spread)) / np.sqrt(spread)
     share = np.maximum(total - expected, 0.0) / np.sum(r**2, axis=(1, 2))
     return np.where(variance > 0, evidence, 0.0), share
