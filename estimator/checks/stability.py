@@ -57,6 +57,8 @@ DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
 FEW = 10.0
 """Over the averages of a part, by how much its scores scatter more where the noise changes."""
+CERTAIN = 4.0
+"""Standard errors by which one change of a sensor is larger than another, to be named for it."""
 SECOND_ORDER = 4.0
 """Times the variance of a response between parts, a change is at most, squared. Scores are linear
 in changes: the share of its statistic that may look like changes of other sensors."""
@@ -218,7 +220,11 @@ class Stability:
             most = critical_value(each.degrees, alarm) + second_order
             if (each.sensor, each.band) in unsteady:  # single segments are tested once
                 most = 0.0
-            if each.sensor in clearest or each.statistic <= most:
+            if each.statistic <= most:
+                continue
+            if each.sensor in clearest:
+                if _is_larger(each, abs(clearest[each.sensor].size)):
+                    clearest[each.sensor] = each
                 continue
             is_added = True
             if seen[each.sensor] > 1 or len(found) == 1 or each.band is not None:
@@ -553,6 +559,9 @@ def _and_unstable(
             left[:, own] = 0.0
             continue
         size = math.sqrt(each.variance)
+        added = np.maximum(added, each.added(nothing + 1))
+        if any(e.sensor == each.sensor and _is_larger(e, size) for e in changes):
+            continue
         change = ResponseChange(
             sensor=each.sensor,
             channel=each.pairs[0][0] if each.channel is not None else None,
@@ -566,8 +575,12 @@ def _and_unstable(
             band=single.band,
         )
         changes = (change, *(e for e in changes if e.sensor != each.sensor))
-        added = np.maximum(added, each.added(nothing + 1))
     return changes, added, left
+
+
+def _is_larger(change: ResponseChange, size: float) -> bool:
+    """Return whether a change is certainly larger than another of the same sensor."""
+    return abs(change.size) - CERTAIN * change.error > size
 
 
 def _also_by_band(

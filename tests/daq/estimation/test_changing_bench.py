@@ -273,6 +273,22 @@ def test_a_gain_that_changes_within_parts_bounds_its_noise(
         assert snapshot.n_effective > 440
 
 
+@pytest.mark.parametrize("gain", [0.0, 0.05])
+def test_of_several_changes_of_a_sensor_the_largest_is_named(gain: float) -> None:
+    """With octaves, .99 % at 2 to 4 Hz were named, or the gain that changes each 25 s."""
+    samples = recorded("", 1, n=2 * N)
+    late, parts = np.arange(2 * N) > N, np.arange(2 * N) // round(25 * RATE)
+    samples["B"][:, 0] *= 1 + gain * (parts % 2)
+    sections = butter(1, 0.05, "high", fs=RATE, output="sos")
+    samples["B"][:, 1] = np.where(late, sosfilt(sections, samples["B"][:, 1]), samples["B"][:, 1])
+    snapshot = huddle.self_noise(samples, fs=RATE, octaves=True).snapshot
+    (change,) = changes(snapshot)
+    assert change.sensors == (1,)
+    assert change.size > 0.2
+    assert change.band is not None
+    assert change.band[1] < 1.0
+
+
 def test_an_estimate_that_still_grows_holds_what_a_step_adds() -> None:
     """Averages are those of all segments until it is finished: noise of B is anything below."""
     recording = recording_of_arrays(recorded("step", 5), RATE)
