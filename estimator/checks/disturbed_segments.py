@@ -147,14 +147,17 @@ def segment_findings(
     ]
     residuals = _Residuals(course, there, at, groups)
     own = np.einsum("fpp->fp", residuals.projector).real
-    leaks = slopes_of(maximum, course.bins[there], psd, frequency) * at.eigenvalues[:, None]
-    leaks = leaks @ at.eigenvectors.conj().swapaxes(1, 2)
-    leaks *= math.sqrt(course.burstiness)
+    slopes = slopes_of(maximum, course.bins[there], psd, frequency) * math.sqrt(course.burstiness)
+    adjoint = at.eigenvectors.conj().swapaxes(1, 2)
+    leaks = slopes * at.eigenvalues[:, None] @ adjoint
+    slopes = slopes @ adjoint
     motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)
     gains = SegmentGains(own, course.bins[there], groups, dims, leaks=leaks, power=motion)
-    powers, felt = [], []
-    for residual, motion in residuals:
+    powers, felt, leaked = [], [], []
+    for group, (residual, motion) in zip(groups, residuals, strict=True):
         powers.append(np.einsum("sfp->sp", np.abs(residual) ** 2))  # faster than a sum
+        edges = motion.swapaxes(0, 1) @ slopes[group].swapaxes(1, 2)
+        leaked.append(np.einsum("fsp->s", np.abs(edges) ** 2))
         felt.append(np.einsum("sfp->s", np.abs(motion) ** 2))
         gains.add(residual, motion)
     part = np.searchsorted(begin, course.times, side="right")
@@ -169,7 +172,9 @@ def segment_findings(
         found, loudness=Loudness.of(np.stack(powers[:n_good])[:, calm], mixing, step, lasts=LASTS)
     )
     degrees = np.array([own[group].sum() for group in groups])
-    out, calm = _disturbed(np.stack(powers[:n_good], axis=1).sum(axis=2), degrees)
+    out, calm = _disturbed(
+        np.stack(powers[:n_good], axis=1).sum(axis=2), degrees, np.stack(leaked[:n_good], axis=1)
+    )
     found = replace(found, is_restless=not calm.all())
     if not out.any() or found.gains:  # what is taken for motion leaves no residual
         return found if found.is_restless else _louder_than_others(found, course, there, dims)
@@ -249,14 +254,19 @@ class _Residuals:
         return np.concatenate([np.mean(np.abs(each[some]) ** 2, axis=0) for each, _ in self])
 
 
-def _disturbed(power: FloatArray, degrees: FloatArray) -> tuple[BoolArray, BoolArray]:
+def _disturbed(
+    power: FloatArray, degrees: FloatArray, leaked: FloatArray
+) -> tuple[BoolArray, BoolArray]:
     """Return whether each segment has outlying residuals, and which groups count.
 
     Those whose powers, (n_segments, n_groups), scatter no more than by `RESTLESS`, of so many
-    complex degrees of freedom. No segment is disturbed if too many are.
+    complex degrees of freedom. No segment is disturbed if too many are. A burst at its edge leaks
+    `leaked` of that segment at most of which it is in the middle, under a Hann window: neighbours.
     """
     middle = median(power)
     scatter = 1.4826 * median(np.abs(power - middle))
     calm = np.asarray(scatter < RESTLESS * middle / np.sqrt(degrees))
-    out = np.asarray(((power - middle) > DISTURBED * scatter)[:, calm].any(axis=1))
+    near = np.pad(leaked, ((1, 1), (0, 0)))
+    most = np.maximum(np.maximum(near[:-2], near[2:]), leaked)
+    out = np.asarray(((power - middle - most) > DISTURBED * scatter)[:, calm].any(axis=1))
     return (out if out.mean() <= MAX_DISTURBED else np.zeros_like(out)), calm
