@@ -71,6 +71,8 @@ class Scene:
         How many samples the count runs ahead though none is lost.
     restarts : mapping of int to (float, float, float)
         Shortest and longest time between restarts, and how long the sensor is gone, in s.
+    bends : int, optional
+        The sensor whose converter follows a curve: 2e-3 of the rms, with waves of half of it.
     """
 
     rates: tuple[float, float, float] = (200.0, 200.0, 200.0)
@@ -82,6 +84,7 @@ class Scene:
     slips: Mapping[int, Sequence[tuple[float, int]]] = field(default_factory=dict)
     leaps: Mapping[int, Sequence[tuple[float, int]]] = field(default_factory=dict)
     restarts: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)
+    bends: int | None = None
     n_channels: int = 3
     seed: int = 1
     reach: float = 0.43
@@ -250,7 +253,10 @@ def _made(scene: Scene) -> tuple[list[SensorLayout], list[Block], Truth]:
         noise = deviation * rng.standard_normal((kept[-1] + 1, scene.n_channels))
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0][: scene.n_channels]
         scale = _COUNTS / deviation
-        counts = np.round(scale * (spline(taken) @ turn.T + noise[kept])).astype(np.int32)
+        felt = spline(taken) @ turn.T
+        if sensor == scene.bends:
+            felt += 2e-3 * felt.std() * np.sin(4 * np.pi * felt / felt.std())
+        counts = np.round(scale * (felt + noise[kept])).astype(np.int32)
         layouts.append(
             SensorLayout(
                 NAMES[sensor],

@@ -54,13 +54,13 @@ def nonlinear_channels(
         if (np.einsum("fii->i", csm).real < _SHOWN * left).all():
             return (), ()
     total = sum(each.n_seen for each in passes)
+    sensor = np.repeat(np.arange(len(dims)), dims)
     for each in passes:
         n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
         wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
         last = max(each.n_seen - 1, 0) * welch.hop
-        for samples in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
-            tested.add(samples)
-    sensor = np.repeat(np.arange(len(dims)), dims)
+        for samples, past in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
+            tested.add(samples, past[sensor])
     response = np.abs(responses(frequency, channels, unit)) ** 2
 
     def in_unit(column: int, frequencies: FloatArray, psd: FloatArray) -> FloatArray:

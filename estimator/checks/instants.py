@@ -100,6 +100,7 @@ def dependences(
     *,
     highest: float,
     most_predictors: int,
+    past: FloatArray | None = None,
 ) -> list[Dependence]:
     """Return where channels depend on their motion, the clearest first.
 
@@ -116,6 +117,8 @@ def dependences(
     highest : float
         Frequency in Hz up to which spectra are known.
     most_predictors : int
+    past : float64, shape (n_segments, n_channels), optional
+        Seconds from the samples of channels to those of segments, interpolated between them.
     """
     found: list[Dependence] = []
     rest = _residuals(spectra, sensor, most_predictors)
@@ -123,8 +126,12 @@ def dependences(
         return found
     for own in _channels(sensor):
         # what others predict: own noise in it would follow itself, where it is in gusts
-        motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2)) - rest[own]
-        of_sensor = _Sensor(motion, rest[own], means[:, own].T, frequency, window)
+        left = rest[own]
+        motion = np.ascontiguousarray(spectra[:, own].transpose(1, 0, 2)) - left
+        if past is not None:  # a converter bends what it samples, at these instants
+            turn = np.exp(-2j * np.pi * past[:, own[0], None] * frequency).astype(np.complex64)
+            motion, left = turn * motion, turn * left
+        of_sensor = _Sensor(motion, left, means[:, own].T, frequency, window)
         for number, band in enumerate(_bands(frequency, highest)):
             clear = of_sensor.clearest(band, is_highest=number == 0)
             found += [replace(one, channel=int(own[one.channel])) for one in clear]

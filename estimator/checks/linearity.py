@@ -89,11 +89,16 @@ class SquaresAndCubes:
         self._spectra: list[NDArray[np.complex64]] = []
         self._whole: list[NDArray[np.complex64]] = []
         self._means: list[FloatArray] = []
+        self._past: list[FloatArray | float] = []
         self._first: FloatArray | float = 0.0
         self._frequencies, self._highest = welch.frequencies, float(self.frequency.max(initial=0))
 
-    def add(self, samples: FloatArray) -> None:
-        """Add a segment, (segment_length, n_channels), unless it is disturbed."""
+    def add(self, samples: FloatArray, past: FloatArray | float = 0.0) -> None:
+        """Add a segment, (segment_length, n_channels), unless it is disturbed.
+
+        `past`: seconds from the samples of each channel to those of the segment, which are
+        interpolated between them.
+        """
         mean = samples.mean(axis=0)
         centred = samples.T - mean[:, None]
         size = np.sqrt(np.mean(centred**2, axis=1))
@@ -111,6 +116,7 @@ class SquaresAndCubes:
         if len(self._whole) * spectra[0].size < MOST_VALUES:
             self._whole.append(spectra[0].copy())  # a view would keep squares and cubes
             self._means.append((mean - self._first) / self._scale)
+            self._past.append(past)
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
@@ -150,6 +156,7 @@ class SquaresAndCubes:
         """
         if self._scale is None or len(self._whole) < LEAST_LEFT:
             return []
+        past = np.array(self._past)
         found = dependences(
             np.stack(self._whole),
             np.stack(self._means),
@@ -158,6 +165,7 @@ class SquaresAndCubes:
             sensor,
             highest=self._highest,
             most_predictors=MOST_PREDICTORS,
+            past=past if past.any() else None,
         )
         scale = self._density * self._scale**2
         return [replace(each, explained=scale[each.channel] * each.explained) for each in found]

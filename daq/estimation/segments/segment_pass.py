@@ -907,6 +907,14 @@ class Pass:
         seconds = origin * 1e-9 + at / self.welch.sampling_rate
         return np.asarray(seconds[:, None] - self.aligned.delays(at))
 
+    def _past_samples(self, at: float) -> FloatArray:
+        """Return by how many seconds an instant of the grid is past a sample of each sensor."""
+        if self.aligned.is_exact:
+            return np.zeros(len(self._sensors))
+        place = self._seconds_of_sensors(np.array([at]))[0] * self._rates
+        past = (place - np.round(place)) / self._rates
+        return np.where(self._rates == self.welch.sampling_rate, past, 0.0)
+
     def _clipped(self, start: int, n_samples: int) -> NDArray[np.bool_] | None:
         """Return which grid samples lie in blocks that are clipped; None if none do."""
         if self._settings.reject is False:
@@ -917,10 +925,11 @@ class Pass:
 
         return in_clipped_blocks(self._sensors, times)
 
-    def whole_segments(self, starts: NDArray[np.int64]) -> Iterator[FloatArray]:
+    def whole_segments(self, starts: NDArray[np.int64]) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Yield the segments that begin at grid samples; none with gaps, clipped or excluded.
 
-        Neighbours are read together.
+        And by how many seconds their samples are past those of each sensor, between which they
+        are interpolated: 0 at another rate. Neighbours are read together.
         """
         length = self.welch.segment_length
         far = np.flatnonzero(np.diff(starts) > _NEIGHBOURS * length) + 1
@@ -935,7 +944,7 @@ class Pass:
             for begin in (some - first).tolist():
                 own = slice(begin, begin + length)
                 if len(samples[own]) == length and usable[own].all():
-                    yield samples[own]
+                    yield samples[own], self._past_samples(first + begin + length / 2)
 
     @property
     def awaited(self) -> int:

@@ -94,6 +94,13 @@ def test_what_only_arrivals_know_is_followed_and_stated_as_perhaps_the_hosts(
     assert (stated > real).all()
 
 
+@pytest.mark.parametrize("bends", [0, pytest.param(2, marks=LONG)])
+def test_a_converter_bends_what_it_samples_by_its_own_clock(tmp_path: Path, bends: int) -> None:
+    """Between its samples, at the instants that sensors have in common, nothing is seen of it."""
+    snapshot, _ = estimated(tmp_path, scene_of(snr=1e6, seconds=300.0, bends=bends))
+    assert {each.column // 3 for each in snapshot.dependent} == {bends}
+
+
 @pytest.mark.parametrize(("sensor", "ppm"), [(1, -987), (0, -1000)])
 def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(
     tmp_path: Path, sensor: int, ppm: float

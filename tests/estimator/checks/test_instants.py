@@ -39,11 +39,13 @@ def bench(rng: np.random.Generator, ratio: float, n_sensors: int, d: int) -> lis
     return [motion @ np.linalg.qr(rng.standard_normal((d, d)))[0].T for _ in range(n_sensors)]
 
 
-def dependences(rng: np.random.Generator, sensors: list[np.ndarray]) -> list[Dependence]:
+def dependences(
+    rng: np.random.Generator, sensors: list[np.ndarray], past: tuple[float, ...] = (0.0,)
+) -> list[Dependence]:
     samples = np.hstack([each + rng.standard_normal(each.shape) for each in sensors])
     tested = SquaresAndCubes(WELCH, 47.0)
     for segment in samples.reshape(MOST_SEGMENTS, WELCH.segment_length, -1):
-        tested.add(segment)
+        tested.add(segment, np.repeat(past, samples.shape[1] // len(past)))
     return tested.dependences(np.repeat(np.arange(len(sensors)), sensors[0].shape[1]))
 
 
@@ -78,6 +80,25 @@ def test_noise_that_lasts_a_little_longer_than_the_motion_is_loud_is_found() -> 
     rattles = np.convolve(np.abs(x) > 2 * x.std(), np.ones(10), "same") > 0
     sensors[0] += 2.3 * rattles[:, None] * rng.standard_normal((N_SAMPLES, 3))
     assert {each.channel // 3 for each in dependences(rng, sensors)} == {0}
+
+
+@pytest.mark.parametrize("past", [0.0, 0.003, -0.004])
+def test_a_converter_bends_what_it_samples_by_its_own_clock(past: float) -> None:
+    """Segments have samples at other instants, between which the curve is not seen."""
+
+    def shifted(x: np.ndarray, seconds: float) -> np.ndarray:
+        frequency = np.fft.rfftfreq(N_SAMPLES, 1 / RATE)[:, None]
+        turn = np.exp(2j * np.pi * frequency * seconds)
+        return np.fft.irfft(turn * np.fft.rfft(x, axis=0), N_SAMPLES, axis=0)
+
+    rng = np.random.default_rng(7)
+    sensors = bench(rng, 60.0, 3, 3)
+    own = shifted(sensors[1], -past)
+    own += 2e-3 * own.std() * np.sin(4 * np.pi * own / own.std())
+    sensors[1] = shifted(own, past)
+    found = dependences(rng, sensors, past=(0.0, past, 0.0))
+    assert {(each.channel // 3, each.form) for each in found} == {(1, "curve")}
+    assert not past or not dependences(rng, sensors)
 
 
 def test_a_product_of_two_axes_is_in_its_channel() -> None:
