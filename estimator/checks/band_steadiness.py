@@ -16,6 +16,7 @@ import numpy as np
 from estimator.checks.disturbed_segments import FREQUENCIES
 from estimator.checks.steadied import LEAST_MOTION
 from estimator.checks.steadiness import (
+    BEYOND_GUSTS,
     FALSE_ALARM,
     VALUES_AT_ONCE,
     PartLevels,
@@ -51,8 +52,6 @@ LEAST_SHARE = 0.01
 """Share of a channel beside the motion, from which what its regression explains counts."""
 ADDED = 0.05
 """Share of the noise that changes of responses add, from which a band shows them."""
-BEYOND_GUSTS = 5.0
-"""Motion and noise over noise, to which noise that changes does not come by scatter."""
 LEAKS = 0.85
 """Coherency of two channels, from which a response that varies over a band leaves motion beside its
 mean."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimator.checks.loudness import LASTS, Loudness, without_bursts
 from estimator.checks.segment_gains import SegmentGains, UnsteadyGain
-from estimator.checks.steadiness import slopes_of
+from estimator.checks.steadiness import BEYOND_GUSTS, slopes_of
 from estimator.likelihood import fisher
 from estimator.likelihood.factor_analysis import Maximum
 from estimator.median import median
@@ -152,14 +152,17 @@ def segment_findings(
     leaks = slopes * at.eigenvalues[:, None] @ adjoint
     slopes = slopes @ adjoint
     motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)
-    gains = SegmentGains(own, course.bins[there], groups, dims, leaks=leaks, power=motion)
+    strong = [bool(median(at.eigenvalues[group, -1]) > BEYOND_GUSTS) for group in groups]
+    loud = list(itertools.compress(groups, strong))
+    gains = SegmentGains(own, course.bins[there], loud, dims, leaks=leaks, power=motion)
     powers, felt, leaked = [], [], []
-    for group, (residual, motion) in zip(groups, residuals, strict=True):
+    for group, is_strong, (residual, motion) in zip(groups, strong, residuals, strict=True):
         powers.append(np.einsum("sfp->sp", np.abs(residual) ** 2))  # faster than a sum
         edges = motion.swapaxes(0, 1) @ slopes[group].swapaxes(1, 2)
         leaked.append(np.einsum("fsp->s", np.abs(edges) ** 2))
         felt.append(np.einsum("sfp->s", np.abs(motion) ** 2))
-        gains.add(residual, motion)
+        if is_strong:
+            gains.add(residual, motion)
     part = np.searchsorted(begin, course.times, side="right")
     found = replace(none, gains=gains.unsteady(part))
     groups = groups[:n_good]

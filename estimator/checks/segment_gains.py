@@ -127,7 +127,7 @@ class SegmentGains:
         """
         first = np.flatnonzero(np.diff(part, prepend=-1))
         n_blocks = len(part) // TOGETHER
-        if len(self._score) == 1 or n_blocks < TOGETHER:
+        if len(self._score) < 2 or n_blocks < TOGETHER:
             return ()
         score, weight = np.stack(self._score), np.stack(self._weight)
         total = np.add.reduceat(weight, first, axis=1)

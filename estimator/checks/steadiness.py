@@ -49,6 +49,8 @@ COST = 4.0
 """Of each parameter of a change, in terms of chi-squared: simple changes are named."""
 STEEPEST = 2 / 3
 """Power that leaks by a slope of one per bin where a Hann window is steepest, over the motion."""
+BEYOND_GUSTS = 5.0
+"""Motion and noise over noise, to which noise that changes does not come by scatter."""
 FALSE_ALARM = 2e-3
 """Probability that steady responses of any sensor are found to change."""
 

@@ -194,6 +194,19 @@ def test_one_burst_of_motion_is_no_noise_that_changes(seed: int) -> None:
     assert steady is None or steady.inflation == 1
 
 
+def test_gusts_beside_weaker_motion_are_no_gain_that_changes() -> None:
+    """What stands for the motion has their noise: all of its gains "changed" by 50 %."""
+    rng, n = np.random.default_rng([2, 47]), 30000
+
+    def gust(size: float) -> np.ndarray:
+        return np.exp(size * np.interp(np.arange(n) / 150, np.arange(203), rng.normal(size=203)))
+
+    motion = np.sqrt(0.3) * rng.standard_normal(n) * gust(0.8)
+    samples = {name: motion + rng.standard_normal(n) * gust(0.6) for name in "ABC"}
+    found = huddle.self_noise(samples, fs=50.0, segment="10s").snapshot.diagnostics
+    assert "response-changes" not in {each.name for each in found.advice}
+
+
 def test_motion_by_other_axes_is_a_misfit_and_no_noise_that_changes() -> None:
     rng = np.random.default_rng(1)
     loud = 14 * np.exp(rng.standard_normal(12)).repeat(N // 12)[:, None]
