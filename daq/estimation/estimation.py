@@ -39,6 +39,7 @@ from daq.estimation.equalisation import (
     ROUNDS,
     Equalisation,
 )
+from daq.estimation.freed_memory import give_back
 from daq.estimation.noise_estimates import Dimensions, averages
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
@@ -346,6 +347,7 @@ class Estimation:
             repeat(done - self.n_seen)
             self._equalisation.reset()
             bands = self._take_all(count, repeat)
+        give_back()  # what threads keep is not used again
         snapshot = self._snapshots.build(self._recordings, self._passes, final=True, raw=bands)
         nothing = not any(np.isfinite(each.noise_psd).any() for each in snapshot.results.values())
         if nothing and (snapshot.results or snapshot.refused or not snapshot.n_segments):

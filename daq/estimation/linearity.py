@@ -13,7 +13,7 @@ from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
 from estimator.levels.interval import unpredicted
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.multiresolution import Band
-from estimator.types import FloatArray
+from estimator.types import FloatArray, IntArray
 
 _OF_SQUARES = 0.02
 """Power that squares and cubes explain, over the most that depends on the motion, from which these
@@ -53,14 +53,8 @@ def nonlinear_channels(
         left = unpredicted(csm, dims=dims, n_effective=averages)[0].sum(axis=0)
         if (np.einsum("fii->i", csm).real < _SHOWN * left).all():
             return (), ()
-    total = sum(each.n_seen for each in passes)
     sensor = np.repeat(np.arange(len(dims)), dims)
-    for each in passes:
-        n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
-        wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
-        last = max(each.n_seen - 1, 0) * welch.hop
-        for samples, past in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
-            tested.add(samples, past[sensor])
+    _add_segments(tested, passes, sensor)
     response = np.abs(responses(frequency, channels, unit)) ** 2
 
     def in_unit(column: int, frequencies: FloatArray, psd: FloatArray) -> FloatArray:
@@ -93,6 +87,16 @@ def nonlinear_channels(
         or each.column not in by_squares
         or by_squares[each.column].sum() < _OF_SQUARES * each.most.sum()
     )
+
+
+def _add_segments(tested: SquaresAndCubes, passes: Sequence[Pass], sensor: IntArray) -> None:
+    total, welch = sum(each.n_seen for each in passes), passes[0].welch
+    for each in passes:
+        n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
+        wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
+        last = max(each.n_seen - 1, 0) * welch.hop
+        for samples, past in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
+            tested.add(samples, past[sensor])
 
 
 def linearised(

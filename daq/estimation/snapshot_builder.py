@@ -33,6 +33,7 @@ from daq.estimation.diagnosis import (
     with_findings,
 )
 from daq.estimation.equalisation import METHOD, Equalisation
+from daq.estimation.freed_memory import give_back
 from daq.estimation.linearity import linearised, nonlinear_channels
 from daq.estimation.noise_estimates import (
     Channels,
@@ -383,6 +384,10 @@ class SnapshotBuilder:
         maxima: Maxima,
     ) -> Estimates:
         """Estimate beside noise that the diagnosis finds to change, without dimensions that are."""
+        methods = set(self._settings.for_sensors(of_all[3].aligned.dims).methods)
+        if not methods & {"maximum-likelihood", "all"}:
+            maxima.clear()  # they are as large as all averages
+        give_back()
         self._dimensions = beside_changing_noise(found, of_all[0], self._findings.stability)
         return self._estimates(*of_all, maxima=maxima, final=False)
 

@@ -43,7 +43,7 @@ from estimator.checks.stability import Stability, stability
 from estimator.errors import InsufficientDataError
 from estimator.likelihood import fisher
 from estimator.likelihood.dimension import bands
-from estimator.likelihood.factor_analysis import Maxima, Maximum, joined
+from estimator.likelihood.factor_analysis import Maxima, Maximum
 from estimator.likelihood.goodness_of_fit import (
     HANN_HALF,
     BandTest,
@@ -607,7 +607,7 @@ def _fit(
     if n_effective <= n_channels:
         return Untested.TOO_FEW_AVERAGES
     try:
-        return joined(
+        return maxima.joined(
             [
                 maxima.maximise(testable(part.block(some), frequency[some]), q)
                 for some in blocks(len(frequency), n_channels)

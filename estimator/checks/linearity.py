@@ -114,7 +114,7 @@ class SquaresAndCubes:
         spectra = np.fft.rfft(terms).astype(np.complex64)
         self._spectra.append(spectra[:, :, self.bins].transpose(2, 1, 0))
         if len(self._whole) * spectra[0].size < MOST_VALUES:
-            self._whole.append(spectra[0].copy())  # a view would keep squares and cubes
+            self._whole.append(spectra[:1].copy())  # a view would keep squares and cubes
             self._means.append((mean - self._first) / self._scale)
             self._past.append(past)
 
@@ -154,11 +154,12 @@ class SquaresAndCubes:
 
         `explained` has the channel's unit**2/Hz, at all frequencies of the transform.
         """
-        if self._scale is None or len(self._whole) < LEAST_LEFT:
+        if self._scale is None or sum(map(len, self._whole)) < LEAST_LEFT:
             return []
         past = np.array(self._past)
+        self._whole = [np.concatenate(self._whole)]
         found = dependences(
-            np.stack(self._whole),
+            self._whole[0],
             np.stack(self._means),
             self._frequencies,
             self._window,

@@ -569,12 +569,13 @@ def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
     place = np.rint((f - f[0]) / step).astype(np.int64)
     # eight delays per period of the highest frequency resolve every peak
     n = 1 << int(np.ceil(np.log2(8 * max(f[-1] / step, place[-1] + 1))))
-    flat = transfer.reshape(len(f), -1).T
-    spectra = np.zeros((len(flat), n), np.complex128)
-    spectra[:, place] = flat  # as frequencies are a step apart at least
     delays = np.fft.fftfreq(n, step)
-    total = np.fft.ifft(spectra) * np.exp(2j * np.pi * f[0] * delays)
-    return float(delays[np.argmax((total.real**2).sum(axis=0))])
+    turn, power = np.exp(2j * np.pi * f[0] * delays), np.zeros(n)
+    for each in transfer.reshape(len(f), -1).T:
+        spectra = np.zeros(n, np.complex128)
+        spectra[place] = each  # as frequencies are a step apart at least
+        power += (np.fft.ifft(spectra) * turn).real ** 2
+    return float(delays[np.argmax(power)])
 
 
 def _horizontal_channels(d: int, vertical: int | None) -> tuple[int, int] | None:

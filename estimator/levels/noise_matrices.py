@@ -326,12 +326,19 @@ def inverse_of_sensors(matrix: ComplexArray, sensor: IntArray) -> ComplexArray:
     return found
 
 
-def white(matrix: ComplexArray, whitener: ComplexArray, sensor: IntArray) -> ComplexArray:
-    """Return ``W S W*``, where W has one block for each sensor."""
+def white(
+    matrix: ComplexArray, whitener: ComplexArray, sensor: IntArray, own: IntArray | None = None
+) -> ComplexArray:
+    """Return ``W S W*``, where W has one block for each sensor; `own` is that of each matrix."""
     if not are_many(sensor):
-        return np.asarray(whitener @ matrix @ whitener.conj().swapaxes(1, 2))
+        found = np.empty(matrix.shape, np.complex128)
+        for some in blocks(len(matrix), len(sensor)):
+            W = whitener[some] if own is None else whitener[own[some]]
+            np.matmul(W @ matrix[some], W.conj().swapaxes(1, 2), out=found[some])
+        return found
     of_sensors = np.arange(len(sensor)).reshape(int(sensor[-1]) + 1, -1, 1)
     W = whitener[:, of_sensors, of_sensors.swapaxes(1, 2)]
+    W = W if own is None else W[own]
     for _ in range(2):
         rows = W @ matrix.reshape(len(matrix), *of_sensors.shape[:2], len(sensor))
         matrix = rows.reshape(matrix.shape).conj().swapaxes(1, 2)
@@ -345,8 +352,12 @@ def without(matrix: ComplexArray, U: ComplexArray) -> ComplexArray:
     """
     along = matrix @ U
     along -= U @ (U.conj().swapaxes(1, 2) @ along) / 2
-    taken = U @ along.conj().swapaxes(1, 2)
-    return np.asarray(matrix - taken - taken.conj().swapaxes(1, 2))
+    found = np.empty(matrix.shape, np.complex128)
+    for some in blocks(*matrix.shape[:2]):
+        taken = U[some] @ along[some].conj().swapaxes(1, 2)
+        np.subtract(matrix[some], taken, out=found[some])
+        found[some] -= taken.conj().swapaxes(1, 2)
+    return found
 
 
 def leading(

@@ -317,7 +317,7 @@ def _pool(
     largest = k * 2 ** np.log2(np.maximum(sizes // (k * LEAST_PARTS), 1)).astype(np.int64)
     # what the largest sub-blocks do not resolve, smaller ones do not either, but for a few
     parts, mean = cut(at, k)
-    X = white(mean, whitener[parts.block], sensor)
+    X = white(mean, whitener, sensor, parts.block)
     stands = np.einsum("bii->bi", X).real.max(axis=1) > _edge(p, parts)  # a bound of eigenvalues
     open_ = ~np.logical_or.reduceat(stands, parts.first)[parts.block]
     axis = _axes(X[open_], 1)
@@ -325,11 +325,11 @@ def _pool(
     stands[open_] = power > _edge(p, parts)[open_]
     best[np.logical_or.reduceat(stands, parts.first)] = -1
     parts, mean = cut(at, largest)
-    r = _n_resolved(white(mean, whitener[parts.block], sensor), parts, q, sensor)
+    r = _n_resolved(white(mean, whitener, sensor, parts.block), parts, q, sensor)
     at = at[(q > 0) & ((r > 0) | (best < 0))]
     while len(at):
         parts, mean = cut(at, k[at])
-        r = _n_resolved(white(mean, whitener[at][parts.block], sensor), parts, q[at], sensor)
+        r = _n_resolved(white(mean, whitener[at], sensor, parts.block), parts, q[at], sensor)
         more = at[r > best[at]]
         if len(more):
             parts, mean = cut(more, k[more])
@@ -395,16 +395,14 @@ def _fitted(
 
     `mean` are the matrices of the sub-blocks, `unit` are the units of the blocks.
     """
-    p = mean.shape[1]
+    p, (a, b) = mean.shape[1], pairs(sensor)
     own, N, whole = parts.block, parts.averages, parts.whole
-    a, b = pairs(sensor)
-    r, wanted = np.zeros(len(q), np.int64), q
-    at_most = np.maximum(q, most)
+    r, wanted, at_most = np.zeros(len(q), np.int64), q, np.maximum(q, most)
     whitener = _start(mean, parts, sensor)
     common: _Weak | None = None
     turn = 0
     while True:
-        X = white(mean, whitener[own], sensor)
+        X = white(mean, whitener, sensor, own)
         U, n_own = np.zeros((len(own), p, 0), np.complex128), np.zeros(len(own), np.int64)
         taken, loss, weak = np.zeros(len(own)), np.ones(len(q)), np.zeros_like(q)
         if resolve:
@@ -446,6 +444,8 @@ def _fitted(
             turn = 0
         shorter = (axes * np.exp(-step / 2)[:, None, :]) @ axes.conj().swapaxes(1, 2)
         whitener = shorter @ whitener
+        del X, Q, rest  # before the next ones are made
+    del X, Q, mean
     root = np.asarray(np.linalg.inv(whitener), np.complex128)
     # noise of a bin is linear in the projected matrix
     weight = weights_beside(root, own, U, sensor)
@@ -468,9 +468,9 @@ def _without_resolved(
     X: ComplexArray, V: ComplexArray, n_own: IntArray, parts: _Parts
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return the mean matrix of each block without the directions V, and their projector's mean."""
-    gain = parts.averages / (parts.averages - n_own)
-    projector = np.eye(X.shape[1]) - V @ V.conj().swapaxes(1, 2)
-    return parts.mean(gain[:, None, None] * without(X, V)), parts.mean(projector)
+    T = without(X, V)
+    T *= (parts.averages / (parts.averages - n_own))[:, None, None]
+    return parts.mean(T), parts.mean(np.eye(X.shape[1]) - V @ V.conj().swapaxes(1, 2))
 
 
 def _least(X: ComplexArray, Q: ComplexArray, parts: _Parts) -> FloatArray:
@@ -647,7 +647,7 @@ def _read(
     elif parts.count.max() == 1:
         noise = fit.gain[:, None] * times(weight, fit.white[:, a, b]).real
     else:
-        X = white(matrix[parts.bins], fit.whitener[parts.block][at], sensor)
+        X = white(matrix[parts.bins], fit.whitener, sensor, parts.block[at])
         y = (Q[at] @ X @ Q[at])[:, a, b]
         noise = fit.gain[at, None] * times(weight[at], y).real
     traces = _traces(weight, fit.white * fit.gain[:, None, None], sensor)

@@ -326,6 +326,11 @@ class Maxima:
         self._found: dict[tuple[int, tuple[int, ...] | None, int], tuple[Maximum, int]] = {}
         self._bytes = 0
 
+    def clear(self) -> None:
+        """Forget them."""
+        self._found.clear()
+        self._bytes = 0
+
     def maximise(
         self,
         csm: ComplexArray,
@@ -356,6 +361,16 @@ class Maxima:
                 places.append(each[1])
                 rows.append(row)
         return _assembled(list(sources.values()), len(csm))
+
+    def joined(self, parts: Sequence[Maximum]) -> Maximum:
+        """Return the fits of several sets of frequencies as `joined`, and keep these instead."""
+        whole = joined(parts)
+        first = np.cumsum([0, *(len(part.psi) for part in parts)]).tolist()
+        begin = {id(part): at for part, at in zip(parts, first, strict=False)}
+        for key, (fit, at) in self._found.items():
+            if id(fit) in begin:
+                self._found[key] = whole, begin[id(fit)] + at
+        return whole
 
 
 def joined(parts: Sequence[Maximum]) -> Maximum:

@@ -27,6 +27,7 @@ from itertools import combinations
 
 import numpy as np
 
+from estimator.blocks import blocks
 from estimator.levels.noise_matrices import coupling_beside
 from estimator.levels.noise_matrices import pairs as elements
 from estimator.likelihood import fisher
@@ -262,7 +263,8 @@ def pair_scores(
         sum(r * max(0.0, 1 - lag / len(rows)) for lag, r in enumerate(neighbours, start=1))
     )
     block, first = np.unique(rows // BLOCK, return_index=True)
-    parts = np.add.reduceat(maximum.take(rows).residual[:, i, j], first)
+    of_pairs = [maximum.take(rows[some]).residual[:, i, j] for some in blocks(len(rows), p)]
+    parts = np.add.reduceat(np.concatenate(of_pairs), first)
     power, across = share * _powers(projector, left, i, j)
     return Scores(
         pairs,

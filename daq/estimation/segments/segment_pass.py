@@ -437,7 +437,7 @@ class Pass:
             spectra = self._all.transforms(part.samples, np.arange(count) * hop, work)
             return replace(part, spectra=spectra, products=self._products(spectra, first, out))
 
-        shape = self._all.products_shape
+        shape = self._all.products_shape if max([n for _, n in pieces], default=1) > 1 else ()
         rooms = [(np.empty(shape) if shape else None, Work()) for _ in range(_READERS + 1)]
 
         def summed(numbered: tuple[int, _Span]) -> _Samples | OwnSpectra | _Sums:
