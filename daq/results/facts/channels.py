@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -23,6 +23,11 @@ MUCH_ROUNDING = 0.1
 """Share of the noise from which rounding that channels share is a fact."""
 
 
+def _with(names: Sequence[str], texts: Sequence[str]) -> list[str]:
+    """Return names, each with a text in brackets."""
+    return [f"{name} ({text})" for name, text in zip(names, texts, strict=True)]
+
+
 class ChannelsClipped(Fact):
     """Samples are at the end of the range: the noise of these channels is too high.
 
@@ -35,13 +40,11 @@ class ChannelsClipped(Fact):
     shares: tuple[float, ...]
 
     def _words(self) -> Words:
-        each = zip(self.channels, self.shares, strict=True)
-        channels = [f"{name} ({100 * share:.2g} %)" for name, share in each]
-        who = ", ".join(channels)
+        channels = _with(self.channels, [f"{100 * share:.2g} %" for share in self.shares])
         return Words(
             f"{few(channels)} clipped, so the noise is too high: use a larger range",
-            f"Clipped: {who} of the samples are at the largest or smallest count of the range: the "
-            "noise of these channels is too high.",
+            f"Clipped: {', '.join(channels)} of the samples are at the largest or smallest count "
+            "of the range: the noise of these channels is too high.",
             "Use a larger range, or less motion.",
         )
 
@@ -58,13 +61,11 @@ class ChannelsWrap(Fact):
     bits: tuple[int, ...]
 
     def _words(self) -> Words:
-        each = zip(self.channels, self.bits, strict=True)
-        channels = [f"{name} (at {bits} bits)" for name, bits in each]
-        who = ", ".join(channels)
+        channels = _with(self.channels, [f"at {bits} bits" for bits in self.bits])
         return Words(
             f"Counts of {few(channels)} wrap, so the noise is too high: use a larger range",
-            f"Overflow: the counts of {who} wrap: a value beyond one end of the range continues "
-            "at the other end. The noise of these channels is too high.",
+            f"Overflow: the counts of {', '.join(channels)} wrap: a value beyond one end of the "
+            "range continues at the other end. The noise of these channels is too high.",
             "Use a larger range, or less motion. If the device sends more bits than the bench "
             "file or its settings say, correct the data type.",
         )
@@ -89,15 +90,15 @@ class CodesMissing(Fact):
     bits: tuple[float, ...]
 
     def _words(self) -> Words:
-        each = []
-        for name, step, missing, stuck, bits in zip(
-            self.channels, self.steps, self.n_missing, self.stuck_bits, self.bits, strict=True
+        found = []
+        for step, missing, stuck, bits in zip(
+            self.steps, self.n_missing, self.stuck_bits, self.bits, strict=True
         ):
             what = [f"in steps of {step} counts"] * (step > 1)
             what += [f"bit {listed([str(bit) for bit in stuck])} constant"] if stuck else []
             what += [several(missing, "missing code")] * (missing > 0)
-            each.append(f"{name} ({', '.join(what)}; {bits:.1f} bits are used)")
-        who = ", ".join(each)
+            found.append(f"{', '.join(what)}; {bits:.1f} bits are used")
+        who = ", ".join(_with(self.channels, found))
         is_faulty = any(self.stuck_bits) or any(self.n_missing)
         return Words(
             f"Codes of {few(self.channels)} never occur" + ": check the digitizer" * is_faulty,
@@ -145,15 +146,13 @@ class ChannelsStoodStill(Fact):
     constant: tuple[Seconds, ...]
 
     def _words(self) -> Words:
-        each = zip(self.channels, self.constant, strict=True)
-        channels = [f"{name} (for {seconds:.2g} s)" for name, seconds in each]
-        who = ", ".join(channels)
+        channels = _with(self.channels, [f"for {seconds:.2g} s" for seconds in self.constant])
         return Words(
             f"{few(channels)} had constant counts, a line or a cubic: noise wrong; exclude that "
             "time (--reject)",
-            f"Temporarily not measured: {who} had a constant count, or followed a line or a cubic "
-            "as where a gap is interpolated. The motion missing there counts as noise; the noise "
-            "missing there lowers the level.",
+            f"Temporarily not measured: {', '.join(channels)} had a constant count, or followed a "
+            "line or a cubic as where a gap is interpolated. The motion missing there counts as "
+            "noise; the noise missing there lowers the level.",
             "Exclude that time (--reject; --start and --end for minutes). Import gaps as gaps, not "
             "interpolated, and check the cable and the power supply.",
         )
