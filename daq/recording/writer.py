@@ -501,13 +501,9 @@ class RecordingWriter:
                 # Linux follows the link to the open file only where a folder's descriptor is given.
                 os.link(f"/proc/self/fd/{handle}", place, src_dir_fd=handle, follow_symlinks=True)
                 _LOGGER.warning("%s was renamed while it is recorded: it has both names now", place)
-        try:
-            found = place.stat()
-        except FileNotFoundError:
-            found = None
-        if found is None or not os.path.samestat(found, written):
-            gone = "renamed" if written.st_nlink else "removed"
-            what = gone if found is None else "replaced by another file"
+        gone = "renamed" if written.st_nlink else "removed"
+        what = "replaced by another file" if place.exists() else gone
+        if what == gone or not os.path.samestat(place.stat(), written):
             raise RecordingError(f"{place}: {what} while it was recorded; the recording ends here")
 
     def _write_again(self) -> None:
