@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -291,7 +292,6 @@ class SnapshotBuilder:
         n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
-        steps = sample_steps(latest, channels) if final else None
         nonlinear, dependent = (
             nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ((), ())
         )
@@ -329,6 +329,11 @@ class SnapshotBuilder:
             diagnostics = self._findings.added_to(diagnostics)
         if sets and not raw:
             diagnostics = replace(diagnostics, untested=Untested.INCOMPLETE)
+        rounding: dict[str, Any] = {}
+        if final:
+            about, steps = (frequency, channels, self._unit), sample_steps(latest, channels)
+            rounding["quantisation_psd"] = quantisation_psd(*about, steps)
+            rounding["rounded_alike"] = rounded_alike(csm, *about, steps=steps, passes=passes)
         snapshot = Snapshot(
             frequency=frequency,
             csm=csm,
@@ -366,14 +371,7 @@ class SnapshotBuilder:
             across_axes=self._axes,
             sensitivities=stated_sensitivities(recordings),
             caveats=Caveats.joined(recording.caveats for recording in recordings),
-            quantisation_psd=(
-                None if steps is None else quantisation_psd(frequency, channels, self._unit, steps)
-            ),
-            rounded_alike=(
-                None
-                if steps is None
-                else rounded_alike(csm, frequency, channels, self._unit, steps=steps, passes=passes)
-            ),
+            **rounding,
         )
         return with_contributions(snapshot)
 

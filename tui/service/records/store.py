@@ -509,20 +509,16 @@ def _safe_names(stored: str) -> tuple[str, ...]:
     return tuple(map(_safe_name, json.loads(stored)))
 
 
+_PLAIN = "bench", "entry", "reason", "verdict", "duration", "attempts"
 _FIELDS: dict[str, tuple[str, Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "bench": ("bench", _same, _same),
-    "entry": ("entry", _same, _same),
+    **{name: (name, _same, _same) for name in _PLAIN},
     "due": ("due", utc_text, datetime.fromisoformat),
     "state": ("state", str, RunState),
-    "reason": ("reason", _same, _same),
-    "verdict": ("verdict", _same, _same),
     "started": ("started", utc_text, from_text),
     "ended": ("ended", utc_text, from_text),
-    "duration": ("duration", _same, _same),
     "target_cov": ("until", _end_text, _end),
     "queue": ("queue", int, bool),
     "parts": ("parts", json.dumps, _safe_names),
-    "attempts": ("attempts", _same, _same),
     "pinned": ("pinned", int, bool),
     "removed": ("removed", utc_text, from_text),
     # Renamed, earlier versions could not open the database.
