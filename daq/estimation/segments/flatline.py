@@ -111,16 +111,16 @@ class FlatlineDetector:
         end = len(samples) - _BESIDE
         before, here, after = (samples[_BESIDE + n : end + n : _RUN] for n in (-1, 0, 1))
         bend = before - 2 * here + after
-        some = slice(None, None, max(1, len(at) // 256))
-        usual = median(np.abs(bend[some]))
-        step = np.where(np.abs(bend) > _EXACT * usual, np.abs(bend), np.inf).min(axis=0)
+        some, size = slice(None, None, max(1, len(at) // 256)), np.abs(bend)
+        usual = median(size[some])
+        step = np.where(size > _EXACT * usual, size, np.inf).min(axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             apart = bend[some] / step - np.rint(bend[some] / step)
         counts = (np.abs(apart) < _OF_A_STEP).mean(axis=0) > _MOSTLY
         allowed = np.where(counts, _STEPS * step, _EXACT * usual)
         least = np.where(counts, _COARSE * step, 1e3 * allowed)
         least = np.maximum(least, _STILL * np.abs(here).max(axis=0))
-        row, channel = np.nonzero((np.abs(bend) <= allowed) & (usual > least))
+        channel, row = np.nonzero(((size <= allowed) & (usual > least)).T)  # as they are in memory
         near = at[row][:, None] + np.arange(-_BESIDE, _BESIDE + 1)
         bends = np.abs(np.diff(samples[near, channel[:, None]], 2, axis=1))
         on_it = bends[:, _BESIDE - _RUN : _BESIDE + _RUN - 1] <= allowed[channel, None]
