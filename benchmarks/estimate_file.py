@@ -125,12 +125,12 @@ def _three_hours(folder: Path, hours: float, repeats: int) -> list[Row]:
             at_most=0.5,
             note=f"{stored:.2f} s",
         ),
-        Row(f"memory of an estimate, {hours:g} h", _memory(recorded), "MB", at_most=250.0),
+        Row(f"memory of an estimate, {hours:g} h", _memory(recorded), "MB", at_most=180.0),
         Row(
             f"memory of an estimate, three clocks, {hours:g} h",
             _memory(free),
             "MB",
-            at_most=250.0,
+            at_most=180.0,
         ),
     ]
 

@@ -409,6 +409,12 @@ def test_the_same_matrices_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert fitted == [3, 3]
     assert maxima.maximise(csm[:0], 1).psi.shape == (0, 4)
     np.testing.assert_allclose(found.psi, maximise(csm, 1).psi[::-1], rtol=1e-12)
+    whole = maxima.joined([maxima.maximise(csm[:3], 1), maxima.maximise(csm[3:], 1)])
+    np.testing.assert_array_equal(whole.psi, maxima.maximise(csm, 1).psi)
+    assert len(fitted) == 3  # but for none
+    maxima.clear()
+    maxima.maximise(csm, 1)
+    assert fitted[3:] == [6]
 
 
 def test_many_channels_are_fitted_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:

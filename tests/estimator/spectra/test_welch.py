@@ -8,7 +8,7 @@ from scipy import signal
 
 from estimator.errors import EstimatorError, InsufficientDataError
 from estimator.spectra import welch
-from estimator.spectra.welch import CrossSpectra, WelchSettings, scale
+from estimator.spectra.welch import CrossSpectra, WelchSettings, Work, scale
 from tests.traced_memory import peak_of
 
 RATE = 50.0
@@ -112,9 +112,9 @@ def test_the_result_does_not_depend_on_the_division_of_samples() -> None:
 @pytest.mark.parametrize("window", ["hann", "rectangular"])
 def test_segments_may_be_transformed_before_they_are_added(window: str) -> None:
     samples, settings = np.asfortranarray(noise(5000, 3)), WelchSettings(RATE, 100, window=window)
-    found, starts = CrossSpectra(settings, 3), np.arange(0, 4901, settings.hop)
+    found, starts, work = CrossSpectra(settings, 3), np.arange(0, 4901, settings.hop), Work()
     for some in (starts[:0], starts[:70], starts[70:71], starts[71:]):
-        spectra = found.transforms(samples, some)
+        spectra = found.transforms(samples, some, work)
         found.add_spectra(spectra, found.products(spectra))
     np.testing.assert_allclose(found.csm(), accumulated(samples, settings).csm(), rtol=1e-12)
 
