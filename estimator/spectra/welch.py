@@ -562,7 +562,9 @@ def scale(csm: ComplexArray, response: ComplexArray) -> ComplexArray:
         raise EstimatorError(f"response of shape {response.shape}, expected {csm.shape[:2]}")
     known = np.isfinite(response) & (response != 0)
     inverse = np.where(known, 1 / np.where(known, response, 1), np.nan)
-    return csm * inverse[:, :, None] * inverse[:, None, :].conj()
+    found = csm * inverse[:, :, None]
+    found *= inverse[:, None, :].conj()
+    return found
 
 
 KEPT_FREQUENCIES = 48
