@@ -254,14 +254,15 @@ def left_by_changes(steady: Stability, frequency: FloatArray) -> FloatArray:
 def _nonlinear(snapshot: Snapshot, psd: FloatArray) -> Iterator[Contribution]:
     """Yield what channels that are not linear add to their noise, or may add still.
 
-    Where squares and cubes explain much, other terms may be there: the noise may be any smaller.
+    Where squares and cubes explain much in a block, other terms may be there, at any frequency: the
+    noise may be any smaller.
     """
     explained, below = np.zeros((2, *psd.shape))
     for each in snapshot.nonlinear:
         explained[:, each.column] = each.explained
         before = psd[:, each.column] + (each.explained if snapshot.linearised else 0.0)
         part, whole = (_by_block(snapshot.frequency, power) for power in (each.explained, before))
-        much = part > MUCH_NONLINEAR * whole
+        much = np.any(part > MUCH_NONLINEAR * whole)
         usual = (UNCERTAIN if snapshot.linearised else 1 + UNCERTAIN) * each.explained
         below[:, each.column] = np.where(much, np.maximum(usual, psd[:, each.column]), usual)
     if snapshot.nonlinear:

@@ -28,10 +28,10 @@ def nonlinear_channels(
     frequency: FloatArray,
     channels: Channels,
     unit: str,
-) -> tuple[tuple[NonlinearChannel, ...], tuple[DependentChannel, ...]]:
+) -> tuple[tuple[NonlinearChannel, ...], tuple[DependentChannel, ...], FloatArray | None]:
     """Return the channels that are not linear, and those whose noise depends on their motion.
 
-    The one with the largest evidence first.
+    The one with the largest evidence first. And `Snapshot.bends`.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ def nonlinear_channels(
     tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
     dims = passes[0].aligned.dims
     if not len(tested.bins) or len(dims) < 2:
-        return (), ()
+        return (), (), None
     for band in raw if passes[0].octaves is None else ():
         csm, averages = band.csm[tested.bins], np.full(len(tested.bins), band.n_effective)
         left = unpredicted(csm, dims=dims, n_effective=averages)[0].sum(axis=0)
         if (np.einsum("fii->i", csm).real < _SHOWN * left).all():
-            return (), ()
+            return (), (), None
     sensor = np.repeat(np.arange(len(dims)), dims)
     _add_segments(tested, passes, sensor)
     response = np.abs(responses(frequency, channels, unit)) ** 2
@@ -80,13 +80,14 @@ def nonlinear_channels(
         for each in tested.dependences(sensor)
     ]
     by_squares = {each.column: each.explained for each in nonlinear}
-    return tuple(nonlinear), tuple(
+    dependent = [
         each
         for each in dependent
         if each.form not in {"curve", "gain"}
         or each.column not in by_squares
         or by_squares[each.column].sum() < _OF_SQUARES * each.most.sum()
-    )
+    ]
+    return tuple(nonlinear), tuple(dependent), tested.bends(sensor, list(by_squares))
 
 
 def _add_segments(tested: SquaresAndCubes, passes: Sequence[Pass], sensor: IntArray) -> None:

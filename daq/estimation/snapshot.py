@@ -292,6 +292,8 @@ class Snapshot:
     dependent : tuple of DependentChannel
         Channels whose noise depends on their motion otherwise, the clearest first. Of a finished
         estimate.
+    bends : float64, shape (n_channels,), or None
+        Relative standard uncertainty of gains by what may bend channels; None if not tested.
     linearised : bool
         Whether what is not linear is taken off their noise.
     bridged : Bridged or None
@@ -352,6 +354,7 @@ class Snapshot:
     rounded_alike: SharedRounding | None = None
     nonlinear: tuple[NonlinearChannel, ...] = ()
     dependent: tuple[DependentChannel, ...] = ()
+    bends: FloatArray | None = None
     linearised: bool = False
     bridged: Bridged | None = None
     left_open: tuple[str, ...] = ()

@@ -292,8 +292,10 @@ class SnapshotBuilder:
         n_partial = sum(each.n_segments for each in sets) - (0 if raw else n_segments)
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
-        nonlinear, dependent = (
-            nonlinear_channels(passes, raw, frequency, channels, self._unit) if final else ((), ())
+        nonlinear, dependent, bends = (
+            nonlinear_channels(passes, raw, frequency, channels, self._unit)
+            if final
+            else ((), (), None)
         )
         psd = np.diagonal(csm, axis1=1, axis2=2).real
         if final or (self._diagnoses.is_due and not left):
@@ -365,6 +367,7 @@ class SnapshotBuilder:
             no_segment=None if sets else _no_segment(passes, self._settings.segment),
             nonlinear=nonlinear,
             dependent=dependent,
+            bends=bends,
             linearised=self._settings.linearise and bool(nonlinear),
             bridged=_bridged(passes, estimates.results),
             not_estimated=left,

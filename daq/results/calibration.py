@@ -302,7 +302,7 @@ class _Work:
         """Return a calibration whose matrix, angles and delays have what budgets of gains have.
 
         Their scatter is in them already, and the sensitivity of the reference is none of theirs.
-        Changes of gains turn nothing.
+        Changes of gains turn nothing, nor does what bends a channel unseen.
         """
         diagnosis = self.snapshot.diagnostics.diagnosis
         changes = diagnosis.stability.changes if diagnosis and diagnosis.stability else ()
@@ -312,13 +312,16 @@ class _Work:
             if each.sensor in (found.sensor, found.reference)
         )
         known = {"estimate", "variation", "certificate", "tolerance"}
-        turning = {"linearity", "misfit", *(("drift",) if turns else ())}
+        late = {"linearity", "misfit", *(("drift",) if turns else ())}
+        is_seen = self.snapshot.nonlinear or self.snapshot.dependent
+        turning = late if is_seen else late - {"linearity"}
         parts = [{e.source: e.relative for e in each.components} for each in budgets]
-        gain, direction = (
-            np.array([math.hypot(*(each[n] for n in each if n in which)) for each in parts])
-            for which in ({n for each in parts for n in each} - known, turning)
+        return found.widened(
+            *(
+                np.array([math.hypot(*(each[n] for n in each if n in which)) for each in parts])
+                for which in ({n for each in parts for n in each} - known, turning, late)
+            )
         )
-        return found.widened(gain, direction)
 
     def _unmodelled(self, band: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
         """Return by how much gains may be off where the model does not hold, two of (n_channels,).
@@ -355,27 +358,32 @@ class _Work:
         return math.hypot(sizes[column], sizes[list(self._columns(self._reference))].max())
 
     def _drift(self, column: int) -> float:
-        """Return the standard deviation of a gain over the recording, where responses change."""
-        found = self.snapshot.diagnostics.diagnosis
-        if found is None or found.stability is None:
-            return 0.0
-        added = found.stability.added
-        return float(np.sqrt(added[column] + added[list(self._columns(self._reference))].max()))
+        """Return the standard deviation of a gain over the recording, where responses change.
+
+        While a channel stands still, its gain is 0: the mean gain lacks that share of the time.
+        """
+        found, still = self.snapshot.diagnostics.diagnosis, self.snapshot.diagnostics.stood_still
+        added = np.zeros(len(self.snapshot.channels))
+        if found is not None and found.stability is not None:
+            added += found.stability.added
+        for each, seconds in still.items():
+            added[each] += (seconds / self.snapshot.elapsed) ** 2
+        return math.sqrt(added[column] + added[list(self._columns(self._reference))].max())
 
     def _nonlinearity(self, column: int, inside: np.ndarray) -> float:
         """Return by how much a gain at this loudness may differ from that at another.
 
         A cube ``c x**3`` adds ``3 c s**2`` to the gain, with s the standard deviation, and noise of
         ``6 c**2 s**6``: two thirds of the square of what it adds to the gain, of the motion. A
-        square adds about as much at an offset of s.
+        square adds about as much at an offset of s. What is not found may be `Snapshot.bends`.
         """
         psd = self.snapshot.data_psd[inside]
-        squares = {
-            each.column: 1.5 * float(each.explained[inside].sum() / psd[:, each.column].sum())
-            for each in self.snapshot.nonlinear
-        }
-        most = max(squares.get(each, 0.0) for each in self._columns(self._reference))
-        return math.sqrt(squares.get(column, 0.0) + most)
+        bends = self.snapshot.bends
+        squares = np.zeros(len(self.snapshot.channels)) if bends is None else bends**2
+        for each in self.snapshot.nonlinear:
+            share = float(each.explained[inside].sum() / psd[:, each.column].sum())
+            squares[each.column] = 1.5 * share
+        return math.sqrt(squares[column] + squares[list(self._columns(self._reference))].max())
 
     def _counting(self, column: int, inside: np.ndarray) -> float:
         """Return the relative uncertainty of a gain by the noise of whole counts."""

@@ -88,6 +88,7 @@ class SquaresAndCubes:
         self._scale: FloatArray | None = None
         self._spectra: list[NDArray[np.complex64]] = []
         self._whole: list[NDArray[np.complex64]] = []
+        self._powers: list[FloatArray] = []
         self._means: list[FloatArray] = []
         self._past: list[FloatArray | float] = []
         self._first: FloatArray | float = 0.0
@@ -109,6 +110,7 @@ class SquaresAndCubes:
         x = centred / self._scale[:, None]
         square = x**2
         power = (square @ self._window**2) / (self._window @ self._window)
+        self._powers.append(power)
         terms = np.stack([x, square, x * (square - 3 * power[:, None])])
         terms *= self._window
         spectra = np.fft.rfft(terms).astype(np.complex64)
@@ -149,6 +151,45 @@ class SquaresAndCubes:
             found.append(replace(best, explained=scale * best.explained))
         return found
 
+    def bends(self, sensor: IntArray, known: list[int]) -> FloatArray:
+        """Return by how much what bends a channel may change its gain, as a standard uncertainty.
+
+        Parameters
+        ----------
+        sensor : int64, shape (n_channels,)
+            Sensor of each channel.
+        known : list of int
+            Channels that are not linear: what these explain is regressed out of other sensors.
+
+        Returns
+        -------
+        float64, shape (n_channels,)
+            Relative, at the loudness of the segments. A cube ``c x**3`` changes it by
+            ``3 c s**2``, with s the standard deviation; a dead zone by twice what its cube does.
+            One real c of all frequencies, or its standard error, where that is larger.
+        """
+        found = np.zeros(len(sensor))
+        if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):
+            return found
+        spectra = np.array(self._spectra)
+        power = np.array(self._powers)
+        loudness = (power**2).sum(axis=0) / power.sum(axis=0)
+        for one in range(int(sensor.max()) + 1):
+            own = np.flatnonzero(sensor == one)
+            rest, left = _rest(spectra, sensor, own.tolist(), known)
+            if left < LEAST_LEFT:
+                continue
+            r, q = rest[..., 0], rest[..., 2]
+            weight = 1 / np.maximum(np.mean(np.abs(r) ** 2, axis=1), np.finfo(np.float64).tiny)
+            along = np.einsum("fkc,fkc,fc->kc", q.conj(), r, weight).real
+            size = np.einsum("fkc,fkc,fc->kc", q.conj(), q, weight).real
+            whole = np.maximum(size.sum(axis=0), np.finfo(np.float64).tiny)
+            cube = along.sum(axis=0) / whole
+            error = np.sqrt(len(r[0]) / left * np.sum((along - cube * size) ** 2, axis=0)) / whole
+            most = 6 * np.maximum(np.abs(cube), error) * loudness[own]
+            found[own] = np.fmin(most / np.sqrt(3), 1.0)  # of a rectangular distribution
+        return found
+
     def dependences(self, sensor: IntArray) -> list[Dependence]:
         """Return where noise depends on the motion otherwise, the clearest first.
 
@@ -177,17 +218,11 @@ def _worst(
 ) -> Nonlinear | None:
     """Return the channel of a sensor with evidence and the largest share, besides `known`."""
     own = [c for c in np.flatnonzero(sensor == one).tolist() if c not in known]
-    others = np.flatnonzero(sensor != one)[:MOST_PREDICTORS]
-    further = [c for c in known if sensor[c] != one]
-    left = len(spectra) - len(others) - _TERMS * len(further)
-    if left < LEAST_LEFT or not own or not len(others):
+    if not own:
         return None
-    predictors = np.concatenate(
-        [spectra[:, :, others, 0], *(spectra[:, :, c, 1:] for c in further)], axis=2
-    ).transpose(1, 0, 2)
-    wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
-    rest = without(predictors.astype(np.complex128), wanted.astype(np.complex128))
-    rest = rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS)
+    rest, left = _rest(spectra, sensor, own, known)
+    if left < LEAST_LEFT:
+        return None
     evidence, explained = _explained(rest, block, left)
     of_squares = explained.sum(axis=0)
     unexplained = (np.abs(rest[..., 0]) ** 2).sum(axis=(0, 1)) / left - of_squares
@@ -198,6 +233,24 @@ def _worst(
         if power[n] > LOUD * unexplained[n] and evidence[n] > CERTAIN
     ]
     return max(found, key=lambda each: each.share, default=None)
+
+
+def _rest(
+    spectra: NDArray[np.complex64], sensor: IntArray, own: list[int], known: list[int]
+) -> tuple[ComplexArray, int]:
+    """Return what others leave of channels, squares and cubes, and how many segments are beyond.
+
+    Of the shape (n_freqs, n_segments, n, 3), for channels of one sensor.
+    """
+    others = np.flatnonzero(sensor != sensor[own[0]])[:MOST_PREDICTORS]
+    further = [c for c in known if sensor[c] != sensor[own[0]]]
+    left = len(spectra) - len(others) - _TERMS * len(further)
+    predictors = np.concatenate(
+        [spectra[:, :, others, 0], *(spectra[:, :, c, 1:] for c in further)], axis=2
+    ).transpose(1, 0, 2)
+    wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
+    rest = without(predictors.astype(np.complex128), wanted.astype(np.complex128))
+    return rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS), left
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:

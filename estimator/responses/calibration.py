@@ -98,13 +98,15 @@ class SensorCalibration:
     dof: float
     n_frequencies: int = field(metadata=NOT_IN_JSON)
 
-    def widened(self, gain: FloatArray, direction: FloatArray) -> SensorCalibration:
+    def widened(
+        self, gain: FloatArray, direction: FloatArray, phase: FloatArray
+    ) -> SensorCalibration:
         """Return it with further relative standard errors of each row of the matrix.
 
         Parameters
         ----------
-        gain, direction : float64, shape (d,)
-            Of the length of the row, and across it.
+        gain, direction, phase : float64, shape (d,)
+            Of the length of the row, across it, and of its response a quarter of a wave later.
         """
         M, length = self.matrix.value, self.gain.value
         across = (direction * length)[:, None]
@@ -112,7 +114,7 @@ class SensorCalibration:
         own = 1.0 - np.eye(len(M))  # the diagonal of `cross_axis` is known
         ratio = self.cross_axis.value
         turned, pairs = np.rad2deg(direction), np.triu_indices(len(M), 1)
-        late = direction / (np.pi * (self.low + self.high))
+        late = phase / (np.pi * (self.low + self.high))
         added = {
             "matrix": np.hypot(gain[:, None] * M, across * beside),
             "gain": gain * length,

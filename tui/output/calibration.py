@@ -46,7 +46,7 @@ _SOURCES = {
     "faulty": ("faulty", "a faulty channel"),
     "drift": ("drift", "change of the response during the recording"),
     "changes": ("changes", "motion that a change of the response leaves in the noise"),
-    "linearity": ("lin.", "squares and cubes of the motion, and what follows it"),
+    "linearity": ("lin.", "what is not linear, found or not, and noise that follows the motion"),
 }
 """Short and in words."""
 
