@@ -87,7 +87,7 @@ def nonlinear_channels(
         or each.column not in by_squares
         or by_squares[each.column].sum() < _OF_SQUARES * each.most.sum()
     ]
-    return tuple(nonlinear), tuple(dependent), tested.bends(sensor, list(by_squares))
+    return tuple(nonlinear), tuple(dependent), tested.bends(sensor)
 
 
 def _add_segments(tested: SquaresAndCubes, passes: Sequence[Pass], sensor: IntArray) -> None:

@@ -151,22 +151,21 @@ class SquaresAndCubes:
             found.append(replace(best, explained=scale * best.explained))
         return found
 
-    def bends(self, sensor: IntArray, known: list[int]) -> FloatArray:
+    def bends(self, sensor: IntArray) -> FloatArray:
         """Return by how much what bends a channel may change its gain, as a standard uncertainty.
 
         Parameters
         ----------
         sensor : int64, shape (n_channels,)
             Sensor of each channel.
-        known : list of int
-            Channels that are not linear: what these explain is regressed out of other sensors.
 
         Returns
         -------
         float64, shape (n_channels,)
             Relative, at the loudness of the segments. A cube ``c x**3`` changes it by
             ``3 c s**2``, with s the standard deviation; a dead zone by twice what its cube does.
-            One real c of all frequencies, or its standard error, where that is larger.
+            One real c of all frequencies, or its standard error, where that is larger. Of what
+            another sensor bends, a part is in it.
         """
         found = np.zeros(len(sensor))
         if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):
@@ -176,7 +175,7 @@ class SquaresAndCubes:
         loudness = (power**2).sum(axis=0) / power.sum(axis=0)
         for one in range(int(sensor.max()) + 1):
             own = np.flatnonzero(sensor == one)
-            rest, left = _rest(spectra, sensor, own.tolist(), known)
+            rest, left = _rest(spectra, sensor, own.tolist(), [])
             if left < LEAST_LEFT:
                 continue
             r, q = rest[..., 0], rest[..., 2]
