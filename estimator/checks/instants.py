@@ -256,11 +256,12 @@ class _Sensor:
                 size = float(np.sqrt(share * there[channel] * scale))
             share = min(abs(share), 1.0)
             clear = np.abs(shares[evidence[:, place] >= CERTAIN, place])
-            if form == "product":
+            if form == "product" and factors[0] is factors[1]:
+                form = "curve"  # a part of what bends: the square of its integral, say
+            elif form == "product":
                 alike = course.power(factors[0] * factors[1]) / np.maximum(left[channel], _LEAST)
                 alike *= share / max(float(alike[own].mean()), _LEAST)
                 most = WITHIN_BAND * np.fmin(alike, 1.0) * left[channel]
-                form = "curve" if factors[0] is factors[1] else form
             elif size and share < MUCH:
                 alike = felt[channel] * size**2 * (1.0 if form == "gain" else np.abs(turn) ** 2)
                 alike = np.maximum(share * left[channel, own].mean(), alike)

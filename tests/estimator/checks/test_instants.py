@@ -137,6 +137,7 @@ def test_what_bends_otherwise_is_a_curve(kind: str, ratio: float, size: float) -
     found = dependences(rng, sensors)
     assert {(each.channel, each.form) for each in found} == {(1, "curve")}
     assert not found[0].size
+    assert np.median(found[0].explained) > 4 * 2 / RATE  # all of the noise may be of the motion
 
 
 @pytest.mark.parametrize("most", [1.0, 1.5])
