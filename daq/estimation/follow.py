@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -37,6 +38,7 @@ from daq.recording.storage import locking
 INTERVAL = 20.0
 """Seconds between returns, at least."""
 _M_ARENA_MAX, _HEAPS = -8, 2  # of malloc.h
+_LOOKS, _RENAMED = 4, 0.5  # seconds: a recorder gives a file that was renamed its name back
 
 
 class FreedMemory:
@@ -382,6 +384,9 @@ class _RemoteRecorder:
     @property
     def ended(self) -> bool:
         if locking.LOCKS_ARE_VISIBLE:
+            for _ in range(_LOOKS):
+                if sys.platform == "linux" and not self._recording.path.exists():
+                    time.sleep(_RENAMED)
             return not locking.is_being_written(self._recording.path)
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()

@@ -496,11 +496,12 @@ class RecordingWriter:
         """
         place, handle = self._hidden or self.path, self._handle
         written = os.fstat(handle)
-        if not place.exists():
-            with contextlib.suppress(OSError):  # removed, not Linux, or a disk without hard links
+        if not os.path.lexists(place):
+            # removed, not Linux, or a disk without hard links
+            with contextlib.suppress(OSError, NotImplementedError):
                 # Linux follows the link to the open file only where a folder's descriptor is given.
                 os.link(f"/proc/self/fd/{handle}", place, src_dir_fd=handle, follow_symlinks=True)
-                _LOGGER.warning("%s was renamed while it is recorded: it has both names now", place)
+                _LOGGER.warning("%s lost its name, and has it again beside any other", place)
         gone = "renamed" if written.st_nlink else "removed"
         what = "replaced by another file" if place.exists() else gone
         if what == gone or not os.path.samestat(place.stat(), written):

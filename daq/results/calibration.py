@@ -382,7 +382,7 @@ class _Work:
         squares = np.zeros(len(self.snapshot.channels)) if bends is None else bends**2
         for each in self.snapshot.nonlinear:
             share = float(each.explained[inside].sum() / psd[:, each.column].sum())
-            squares[each.column] = 1.5 * share
+            squares[each.column] = max(squares[each.column], 1.5 * share)
         return math.sqrt(squares[column] + squares[list(self._columns(self._reference))].max())
 
     def _counting(self, column: int, inside: np.ndarray) -> float:

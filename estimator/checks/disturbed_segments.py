@@ -152,7 +152,7 @@ def segment_findings(
     leaks = slopes * at.eigenvalues[:, None] @ adjoint
     slopes = slopes @ adjoint
     motion = np.einsum("fpq,fq->fp", np.abs(at.eigenvectors) ** 2, at.eigenvalues)
-    strong = [bool(median(at.eigenvalues[group, -1]) > BEYOND_GUSTS) for group in groups]
+    strong = [bool(median(at.eigenvalues[group, 0]) > BEYOND_GUSTS) for group in groups]
     loud = list(itertools.compress(groups, strong))
     gains = SegmentGains(own, course.bins[there], loud, dims, leaks=leaks, power=motion)
     powers, felt, leaked = [], [], []

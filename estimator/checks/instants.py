@@ -233,7 +233,9 @@ class _Sensor:
         of_slope = left[tested, own] @ slopes / np.maximum(felt[tested, own] @ slopes, _LEAST)
         ratios = there[tested], of_slope
         bent = [BENT * _bent(*each) for each in zip(ratios, squares, strict=True)]
-        whole = course(motion, slice(0, everything.stop)) + self.means[tested, :, None]
+        whole = (
+            course(motion, slice(0, everything.stop)) + course.scale * self.means[tested, :, None]
+        )
         curve, of_curve = _clearest_curve(r, whole, bent)
         by_product, of_product, factors = _clearest_product(r, x, bent[0])
         # all channels of a sensor are sampled at one instant; their residuals are not independent
@@ -284,12 +286,15 @@ class _Courses:
     ----------
     edges : float32, shape (n_samples,)
         Slope of the window over it.
+    scale : float
+        Of courses, over that of the samples.
     """
 
     def __init__(self, window: FloatArray, stop: int) -> None:
         self._n = n = min(32 * (int(2.5 * stop) // 32 + 1), len(window))
         self._middle, self._n_freqs = slice(n // 4, n - n // 4), len(window) // 2 + 1
-        at = np.arange(n)[self._middle] * (len(window) / n)
+        self.scale = len(window) / n
+        at = np.arange(n)[self._middle] * self.scale
         self._window = np.interp(at, np.arange(len(window)), window).astype(np.float32)
         self.edges = np.gradient(self._window) / self._window
 

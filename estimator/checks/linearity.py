@@ -90,11 +90,11 @@ class SquaresAndCubes:
         self._whole: list[NDArray[np.complex64]] = []
         self._powers: list[FloatArray] = []
         self._means: list[FloatArray] = []
-        self._past: list[FloatArray | float] = []
+        self._past: list[FloatArray] = []
         self._first: FloatArray | float = 0.0
         self._frequencies, self._highest = welch.frequencies, float(self.frequency.max(initial=0))
 
-    def add(self, samples: FloatArray, past: FloatArray | float = 0.0) -> None:
+    def add(self, samples: FloatArray, past: FloatArray | None = None) -> None:
         """Add a segment, (segment_length, n_channels), unless it is disturbed.
 
         `past`: seconds from the samples of each channel to those of the segment, which are
@@ -118,7 +118,7 @@ class SquaresAndCubes:
         if len(self._whole) * spectra[0].size < MOST_VALUES:
             self._whole.append(spectra[:1].copy())  # a view would keep squares and cubes
             self._means.append((mean - self._first) / self._scale)
-            self._past.append(past)
+            self._past.append(np.zeros(len(size)) if past is None else past)
 
     def nonlinear(self, sensor: IntArray) -> list[Nonlinear]:
         """Return the channels that are not linear, the one with the largest share first.
@@ -164,8 +164,8 @@ class SquaresAndCubes:
         float64, shape (n_channels,)
             Relative, at the loudness of the segments. A cube ``c x**3`` changes it by
             ``3 c s**2``, with s the standard deviation; a dead zone by twice what its cube does.
-            One real c of all frequencies, or its standard error, where that is larger. Of what
-            another sensor bends, a part is in it.
+            One real c of all frequencies, or its standard error, where that is larger. It has
+            a part of what another sensor bends.
         """
         found = np.zeros(len(sensor))
         if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):

@@ -57,8 +57,9 @@ DOUBT = 4.0
 """By which a doubtful noise may be wrong as the scale of a test."""
 FEW = 10.0
 """Over the averages of a part, by how much its scores scatter more where the noise changes."""
-CERTAIN = 4.0
-"""Standard errors by which one change of a sensor is larger than another, to be named for it."""
+CERTAIN, FAR = 4.0, 5.0
+"""Standard errors by which one change of a sensor is larger than another, to be named for it; and
+times by which one of some frequencies is."""
 SECOND_ORDER = 4.0
 """Times the variance of a response between parts, a change is at most, squared. Scores are linear
 in changes: the share of its statistic that may look like changes of other sensors."""
@@ -579,8 +580,12 @@ def _and_unstable(
 
 
 def _is_larger(change: ResponseChange, size: float) -> bool:
-    """Return whether a change is certainly larger than another of the same sensor."""
-    return abs(change.size) - CERTAIN * change.error > size
+    """Return whether a change is certainly larger than another of the same sensor.
+
+    Of some frequencies, it is if it is far larger.
+    """
+    least = size if change.band is None else FAR * size
+    return abs(change.size) - CERTAIN * change.error > least
 
 
 def _also_by_band(

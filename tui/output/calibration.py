@@ -44,7 +44,7 @@ _SOURCES = {
     "dimensions": ("dim.", "doubtful number of dimensions of the motion"),
     "axes": ("axes", "motion outside the sensors' axes"),
     "faulty": ("faulty", "a faulty channel"),
-    "drift": ("drift", "change of the response during the recording"),
+    "drift": ("drift", "change of the response, or standstill, during the recording"),
     "changes": ("changes", "motion that a change of the response leaves in the noise"),
     "linearity": ("lin.", "what is not linear, found or not, and noise that follows the motion"),
 }
@@ -98,7 +98,7 @@ def angle(degrees: float, error: float, k: float) -> str:
 def share(relative: float) -> str:
     """Return a relative uncertainty in per cent, to two digits; ∞ where there is no limit."""
     if not math.isfinite(relative):
-        return "∞"
+        return "∞" if relative > 0 else "?"
     if relative < _LEAST_SHOWN:
         return "< 0.001 %" if relative > 0 else "0"
     rounded = float(f"{100 * relative:.2g}")
@@ -191,7 +191,7 @@ def budget_table(budgets: Sequence[Budget]) -> Table:
         totals = (
             share(budget.combined),
             plain_number(budget.k, ".2f"),
-            share(budget.k * budget.combined),
+            share(math.inf if math.isinf(budget.combined) else budget.k * budget.combined),
         )
         parts = (shares.get(source, "") for source in sources)
         rows.append((budget.sensor, budget.channel, *parts, *totals))

@@ -106,8 +106,8 @@ class _Polled:
             key = f"settings.{error.key}" if error.key else "settings"
             raise sensor.fault(key, error.expected, value) from error
         coarse = registers.time_address is not None and registers.resolution_ns * 1e-9
-        if coarse > 1 / sensor.sampling_rate:  # readings of one time are taken for one
-            expected = f"expected at most {1 / coarse:g} Hz, as the time has steps of {coarse:g} s"
+        if 2 * coarse > 1 / sensor.sampling_rate:  # readings of one time are taken for one
+            expected = f"expected at most {0.5 / coarse:g} Hz, half of the rate of its time"
             raise sensor.fault("sampling_rate", expected, sensor.sampling_rate)
         preset = protocol.PRESETS.get(settings.preset or "", {})
         return cls(sensor, settings, registers, given.get("device_id", preset.get("device_id", 1)))

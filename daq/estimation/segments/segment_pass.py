@@ -516,7 +516,7 @@ class Pass:
     def _summed(self, part: _Samples | OwnSpectra, first: int, count: int) -> _Sums | None:
         """Return what a piece adds, without all its spectra; None where segments may be left out.
 
-        Nor of an archive, whose stretches are looked for among them. Threads may call it.
+        None of an archive, too, which assigns segments to stretches. Threads may call it.
         """
         hop = self.welch.hop
         if part.spectra is None or part.products is None or self._ends is None:

@@ -18,9 +18,6 @@ if sys.platform != "win32":
 
 _looking = threading.Lock()
 _WAITS = 0.0, 0.0005, 0.002  # s: a fork lasts less, and a loop that asks waits no longer
-_LOOKS, _RENAMED = 4, 0.5
-"""Looks for a file that is not there, and seconds between them: a recorder gives one that was
-renamed its name back."""
 LOCKS_ARE_VISIBLE: bool = sys.platform != "win32"
 """Whether `is_being_written` works: Windows has only HDF5's own lock."""
 
@@ -48,9 +45,6 @@ def is_being_written(path: Path) -> bool:
     """
     if sys.platform == "win32":  # only HDF5's own lock
         return False
-    for _ in range(_LOOKS):
-        if not path.exists():
-            time.sleep(_RENAMED)
     for wait in _WAITS:
         time.sleep(wait)
         with _looking:

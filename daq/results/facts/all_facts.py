@@ -24,8 +24,8 @@ from estimator.checks.advice import Advice, Rank
 from estimator.checks.advice_on_noise import ResponseChanges, SharedNoise
 from estimator.checks.advice_on_sensors import Gain
 
-MUCH, SEVERAL = 0.5, 3.0
-"""Change of a gain that may explain any other mean, and times a smaller one that may."""
+ALL, ROOM = 0.95, 1.2
+"""Largest change of a gain, and for its errors, in what a mean gain may be off by it."""
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:
@@ -109,9 +109,20 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
 
 
 def _explains(change: ResponseChanges, gain: Gain) -> bool:
-    """Whether a gain may be the mean of one that changes, which biases the noise."""
-    most = SEVERAL * abs(change.size) if abs(change.size) < MUCH else math.inf
-    return change.sensors[0] in gain.sensors and abs(math.log(abs(gain.ratio))) < most
+    """Whether a gain may be the mean of one that changes, which biases the noise.
+
+    It then lies between those before and after, of which either may be as stated.
+    """
+    if change.sensors[0] not in gain.sensors:
+        return False
+    if change.channel not in {None, gain.channel, gain.counterpart}:
+        return False
+    if change.band is not None and gain.band is not None:
+        (low, high), (first, last) = change.band, gain.band
+        if min(high, last) - max(low, first) < (last - first) / 2:
+            return False
+    least = 1 - min(abs(change.size), ALL)  # of its gain over the mean
+    return abs(math.log(abs(gain.ratio))) < -ROOM * math.log(least)
 
 
 def _or_two_alone(snapshot: Snapshot, advice: Advice) -> Advice:

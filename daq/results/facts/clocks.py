@@ -324,7 +324,7 @@ def facts_of_clocks(estimate: Estimate) -> Iterator[Fact]:
 
 
 def _not_understood(estimate: Estimate) -> Iterator[ClockNotUnderstood]:
-    """Yield clocks on which no delays lie: the reference's, where those of all others are not."""
+    """Yield clocks that measured delays contradict: the reference's, where all others are."""
     clocks, against = estimate.snapshot.clocks, reference(estimate.snapshot)
     off = {clock.sensor: clock.residual for clock in clocks if not clock.is_understood}
     others = [residual for sensor, residual in off.items() if sensor != against]

@@ -209,7 +209,7 @@ def bench_at(driver: str, port: str, settings: Sequence[dict[str, Any]]) -> str:
             "registers",
             BUS,
             [{"address": 0, "time_address": 9, "time_format": "uint32-s"}],
-            "expected at most 1 Hz, as the time has steps of 1 s",
+            "expected at most 0.5 Hz, half of the rate of its time",
         ),
         (
             "registers",

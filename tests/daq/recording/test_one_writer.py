@@ -6,6 +6,7 @@ import stat
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 import h5py
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from daq.bench.channel import Channel
 from daq.errors import RecordingError
+from daq.estimation.follow import _RemoteRecorder
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
 from daq.recording.reader import Recording
@@ -91,10 +93,12 @@ def test_a_recording_that_is_renamed_loses_nothing(tmp_path: Path) -> None:
     writer.commit()
     path.rename(other)
     writer.append(Block("a", 100, COUNTS[100:], NOW))
-    with ThreadPoolExecutor(1) as follower:
-        is_written = follower.submit(is_being_written, path)
+    with ThreadPoolExecutor(1) as follower, Recording.open(other) as recording:
+        recording.path = path
+        has_ended = follower.submit(lambda: _RemoteRecorder(recording, Event(), 1.0).ended)
         writer.commit()
-    assert is_written.result()
+        assert not has_ended.result()
+    assert is_being_written(path)
     assert path.samefile(other)
     path.rename(tmp_path / "again.h5")
     writer.close()
