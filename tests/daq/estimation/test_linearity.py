@@ -147,7 +147,7 @@ def test_a_compressed_gain_is_uncertain_by_what_it_lacks() -> None:
             if budget.quantity == "sensitivity" and each.source == "linearity"
         }
         assert max(by_sensor.values()) < 1.3 / 144
-        assert [by_sensor[each] for each in bent] == pytest.approx([1 / 144] * len(bent), rel=0.2)
+        assert [by_sensor[each] for each in bent] == pytest.approx([1 / 144] * len(bent), rel=0.3)
 
 
 def test_a_dead_zone_beside_red_motion_leaves_noise_no_lower_end_anywhere() -> None:
