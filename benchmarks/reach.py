@@ -41,7 +41,7 @@ SHORT = 0.05
 _UNTESTED: dict[str, object] = {
     "estimator.checks.diagnose.stability": None,
     "estimator.checks.diagnose.shared_noise": None,
-    "daq.estimation.snapshot_builder.nonlinear_channels": ((), ()),
+    "daq.estimation.snapshot_builder.nonlinear_channels": ((), (), None),
     "daq.estimation.snapshot_builder.limits_by_column": CountLimits(),
     "daq.estimation.snapshot_builder.still_for_a_while": {},
     "daq.estimation.equalisation.Equalisation.leakage": None,

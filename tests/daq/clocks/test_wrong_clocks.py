@@ -101,7 +101,7 @@ def test_a_converter_bends_what_it_samples_by_its_own_clock(tmp_path: Path, bend
     assert {each.column // 3 for each in snapshot.dependent} == {bends}
 
 
-@pytest.mark.parametrize(("sensor", "ppm"), [(1, -987), (0, -1000)])
+@pytest.mark.parametrize(("sensor", "ppm"), [(1, -987), pytest.param(0, -1000, marks=LONG)])
 def test_samples_lost_all_the_time_are_not_taken_for_a_fast_clock(
     tmp_path: Path, sensor: int, ppm: float
 ) -> None:

@@ -273,7 +273,7 @@ def test_a_gain_that_changes_within_parts_bounds_its_noise(
         assert snapshot.n_effective > 440
 
 
-@pytest.mark.parametrize("gain", [0.0, 0.05])
+@pytest.mark.parametrize("gain", [0.0, pytest.param(0.05, marks=pytest.mark.long)])
 def test_of_several_changes_of_a_sensor_the_largest_is_named(gain: float) -> None:
     """With octaves, .99 % at 2 to 4 Hz were named, or the gain that changes each 25 s."""
     samples = recorded("", 1, n=2 * N)
