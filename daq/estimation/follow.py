@@ -386,7 +386,7 @@ class _RemoteRecorder:
         if locking.LOCKS_ARE_VISIBLE:
             for _ in range(_LOOKS):
                 if sys.platform == "linux" and not self._recording.path.exists():
-                    time.sleep(_RENAMED)
+                    self._wait(_RENAMED)
             return not locking.is_being_written(self._recording.path)
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()
