@@ -25,7 +25,7 @@ from estimator.checks.advice_on_noise import ResponseChanges, SharedNoise
 from estimator.checks.advice_on_sensors import Gain
 
 ALL, ROOM = 0.95, 1.2
-"""Largest change of a gain, and for its errors, in what a mean gain may be off by it."""
+"""Largest change of a gain that counts, and a factor for its error: a mean may be off by that."""
 
 
 def facts_of(estimate: Estimate) -> list[Fact]:

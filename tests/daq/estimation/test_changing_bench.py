@@ -273,6 +273,20 @@ def test_a_gain_that_changes_within_parts_bounds_its_noise(
         assert snapshot.n_effective > 440
 
 
+def test_a_change_excuses_no_sensitivity_that_it_does_not_explain() -> None:
+    """Half as much again is no mean of what rises by a fifth; its step alone says no more."""
+    rng = np.random.default_rng(5)
+    motion = 30 * rng.standard_normal((30_000, 3))
+    rises = (1 + 0.2 * (np.arange(30_000) > 15_000))[:, None]
+    for sensitivity in (1.0, 1.5):
+        samples = {name: motion + rng.standard_normal(motion.shape) for name in "ABC"}
+        samples["B"] = sensitivity * rises * motion + rng.standard_normal(motion.shape)
+        snapshot = huddle.self_noise(samples, fs=100.0, segment="10s").snapshot
+        facts = Result(snapshot, Settings()).facts
+        is_said = any("reads 1." in fact.words.line for fact in facts)
+        assert is_said == (sensitivity > 1)
+
+
 @pytest.mark.parametrize("gain", [0.0, pytest.param(0.05, marks=pytest.mark.long)])
 def test_of_several_changes_of_a_sensor_the_largest_is_named(gain: float) -> None:
     """With octaves, .99 % at 2 to 4 Hz were named, or the gain that changes each 25 s."""
