@@ -421,7 +421,7 @@ class _Recorder:
             raise DiskError(f"{error}; {self._safe()}") from error
         self._file, self._file_started = path, now
         _LOGGER.error("%s; the recording continues in %s", error, path)
-        text = f"continues {before.name}, which could no longer be written"
+        text = f"continues {error}"
         self._writer.write([Event("", EventKind.STATUS, text, now)])
 
     def _safe(self) -> str:

@@ -43,7 +43,7 @@ from daq.recording.description import make_checksums, write_checksums
 from daq.recording.extremes import GrowingFile
 from daq.recording.storage.journal import Journal
 from daq.recording.storage.locking import WriterLock
-from daq.recording.storage.names import publish, remove_leftovers, taken
+from daq.recording.storage.names import give_back, publish, remove_leftovers, taken
 from daq.recording.storage.refusals import text
 from daq.recording.storage.retries import reason_of, repeated
 from daq.recording.storage.trial import remember
@@ -492,20 +492,26 @@ class RecordingWriter:
     def _check_place(self) -> None:
         """Check that the file still has its name; give it back to a file that was renamed.
 
-        Readers, the journal and a service know the file by this name. The other name stays.
+        Readers, the journal and a service know the file by this name.
+
+        Raises
+        ------
+        DiskError
+            If the name leads to another file, or to a copy of what was removed.
         """
         place, handle = self._hidden or self.path, self._handle
-        written = os.fstat(handle)
-        if not os.path.lexists(place):
-            # removed, not Linux, or a disk without hard links
+        if self._journal is not None:
+            self._journal.keep_name()
+        has_lost, again = not os.path.lexists(place), ""
+        if has_lost:
             with contextlib.suppress(OSError, NotImplementedError):
-                # Linux follows the link to the open file only where a folder's descriptor is given.
-                os.link(f"/proc/self/fd/{handle}", place, src_dir_fd=handle, follow_symlinks=True)
-                _LOGGER.warning("%s lost its name, and has it again beside any other", place)
-        gone = "renamed" if written.st_nlink else "removed"
-        what = "replaced by another file" if place.exists() else gone
-        if what == gone or not os.path.samestat(place.stat(), written):
-            raise RecordingError(f"{place}: {what} while it was recorded; the recording ends here")
+                give_back(place, handle)
+                again = ", and has it again"
+        if not place.exists() or not os.path.samestat(place.stat(), os.fstat(handle)):
+            what = "lost its name" if has_lost else "was replaced by another file"
+            raise DiskError(f"{place}: {what} while it was recorded{again}")
+        if again:
+            _LOGGER.warning("%s lost its name%s", place, again)
 
     def _write_again(self) -> None:
         for sensor in self._sensors.values():

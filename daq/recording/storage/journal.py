@@ -18,6 +18,7 @@ incomplete frame.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
@@ -32,6 +33,7 @@ import h5py
 import numpy as np
 
 from daq.recording import file_format
+from daq.recording.storage.names import give_back
 from daq.recording.storage.refusals import MAX_CHUNK
 from daq.recording.storage.retries import repeated
 from daq.recording.storage.superblock import Superblock
@@ -137,6 +139,14 @@ class Journal:
             mask, content = dataset.id.read_direct_chunk((number * length, *corner))
             yield int(mask), bytes(content)
         self._n_chunks[dataset] = n_chunks
+
+    def keep_name(self) -> None:
+        """Give the journal its name again, if the recording was moved with it."""
+        if not os.path.lexists(self.path):
+            with contextlib.suppress(OSError, NotImplementedError):
+                give_back(self.path, self._handle)
+                nameless, self._handle = self._handle, os.open(self.path, os.O_WRONLY | os.O_APPEND)
+                os.close(nameless)
 
     def _append(self, payload: bytes) -> None:
         packed = zlib.compress(payload, 1)

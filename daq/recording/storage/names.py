@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import glob
 import itertools
+import os
 import re
+import shutil
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daq.errors import RecordingError
 from daq.recording.storage.locking import is_being_written
-from daq.whole_file import take_name
+from daq.whole_file import create_private, replaced, take_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,6 +42,27 @@ def publish(temporary: Path, path: Path) -> None:
         take_name(temporary, path)
     except FileExistsError:
         raise taken(path) from None
+
+
+def give_back(path: Path, handle: int) -> None:
+    """Give an open file the name that it had: it, or its folder, was renamed or removed (Linux).
+
+    Another name stays. What a file without any name has is copied; the open file stays nameless.
+
+    Raises
+    ------
+    OSError, NotImplementedError
+        If the system or the disk cannot.
+    """
+    source = f"/proc/self/fd/{handle}"
+    has_name = os.fstat(handle).st_nlink > 0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if has_name:  # the link is followed to the open file only where a folder's descriptor is given
+        os.link(source, path, src_dir_fd=handle, follow_symlinks=True)
+        return
+    with replaced(path, free=True) as part:
+        create_private(part)
+        shutil.copyfile(source, part)
 
 
 def taken(path: Path) -> RecordingError:

@@ -109,7 +109,7 @@ def test_a_recording_continues_in_another_file_after_a_disk_error(tmp_path: Path
         assert second.until == first.until == EndCondition.of_text("5 %")
         assert second.caveats == first.caveats == (Caveat.SIMULATED,)
         texts = [event.text for event in second.events]
-        assert "continues r.h5, which could no longer be written" in texts
+        assert f"continues {path}: cannot be written: File too large" in texts
         for name in "abc":
             one, two = first.sensor(name), second.sensor(name)
             assert two.blocks["first_sample"][0] == 0

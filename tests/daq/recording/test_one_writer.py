@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from daq.bench.channel import Channel
-from daq.errors import RecordingError
+from daq.errors import DiskError, RecordingError
 from daq.estimation.follow import _RemoteRecorder
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
@@ -63,31 +63,47 @@ def test_the_later_of_two_recorders_with_one_name_fails(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the names of open files")
-@pytest.mark.parametrize("replaced", [True, False])
-def test_a_recording_that_loses_its_name_ends(tmp_path: Path, *, replaced: bool) -> None:
+def test_a_recording_that_is_replaced_goes_on_in_another(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "r.h5"
     writer = create(path)
     writer.append(Block("a", 0, COUNTS, NOW))
     writer.commit()
-    if replaced:
-        record(tmp_path / "other.h5")
-        (tmp_path / "other.h5").replace(path)
-        said = "replaced by another file while it was recorded"
-    else:
-        path.unlink()
-        said = "removed while it was recorded"
-    with pytest.raises(RecordingError, match=said):
+    record(tmp_path / "other.h5")
+    (tmp_path / "other.h5").replace(path)
+    with pytest.raises(DiskError, match="was replaced by another file while it was recorded"):
         writer.commit()
     with pytest.raises(RecordingError):
         writer.close()
-    if replaced:
-        assert verify(path).closed
+    assert verify(path).closed
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="an open file gets a name by /proc")
+@pytest.mark.parametrize("with_journal", [True, False])
+def test_what_was_safe_in_a_removed_recording_stays(tmp_path: Path, *, with_journal: bool) -> None:
+    """It was moved to another disk, and the copy there lacks what came meanwhile."""
+    path = tmp_path / "folder" / "r.h5"
+    writer = create(path)
+    writer.append(Block("a", 0, COUNTS[:100], NOW))
+    writer.commit()
+    path.unlink()
+    if with_journal:
+        journal_path(path).unlink()
+    writer.append(Block("a", 100, COUNTS[100:], NOW))
+    with pytest.raises(DiskError, match="lost its name while it was recorded, and has it again"):
+        writer.commit()
+    writer.abandon()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with path.open("r+b") as torn:  # by a power cut: the journal is needed
+        torn.write(bytes(48))
+    repair(path)
+    with Recording.open(path) as recording:
+        assert recording.sensor("a").n_samples == 100
+        np.testing.assert_array_equal(recording.sensor("a").counts(), COUNTS[:100])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="an open file gets a name by /proc")
 def test_a_recording_that_is_renamed_loses_nothing(tmp_path: Path) -> None:
-    path, other = tmp_path / "r.h5", tmp_path / "folder" / "other.h5"
-    other.parent.mkdir()
+    path, other = tmp_path / "folder" / "r.h5", tmp_path / "other.h5"
     writer = create(path)
     writer.append(Block("a", 0, COUNTS[:100], NOW))
     writer.commit()
@@ -100,6 +116,9 @@ def test_a_recording_that_is_renamed_loses_nothing(tmp_path: Path) -> None:
         assert not has_ended.result()
     assert is_being_written(path)
     assert path.samefile(other)
+    path.parent.rename(tmp_path / "moved")  # with its journal
+    writer.commit()
+    assert journal_path(path).exists()
     path.rename(tmp_path / "again.h5")
     writer.close()
     assert not journal_path(path).exists()
