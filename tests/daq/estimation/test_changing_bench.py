@@ -36,6 +36,8 @@ def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, 
         motion[n // 2 :] = 0
     if kind == "red":
         motion = 1e-2 * np.cumsum(np.cumsum(motion - motion.mean(axis=0), axis=0), axis=0)
+    if "weak" in kind:  # one of three directions is as loud as the noise
+        motion[:, 2] /= np.sqrt(ratio)
     if "bursts" in kind:  # of 6 s
         motion *= (np.arange(n) / RATE % (300 if "few" in kind else 30) < 6)[:, None]
     later = time >= 0.4
@@ -54,7 +56,7 @@ def recorded(kind: str, seed: int, ratio: float = 1e4, n: int = N) -> dict[str, 
             felt[later] = felt[later] @ Rotation.from_rotvec([0, 0, np.radians(0.05)]).as_matrix()
         elif name == "B" and kind == "jitter":  # in steps of 4 s
             felt *= 1 + 0.02 * rng.standard_normal((n // 80, 1)).repeat(80, axis=0)
-        elif name == "B" and kind == "halves":  # a part of time is 20 segments, of 2.5 s each
+        elif name == "B" and "halves" in kind:  # a part of time is 20 segments, of 2.5 s each
             felt[np.arange(n) // round(25 * RATE) % 2 == 1, 0] *= 1.05
         elif kind == "temperature":
             felt *= 1 + 0.02 * rng.standard_normal(3) * (np.sin(np.pi * time) - 0.5)[:, None]
@@ -255,6 +257,7 @@ def test_of_few_averages_beside_weak_motion_a_large_step_is_no_noise(
         pytest.param("jitter", None, 0.01, 1e4, "", marks=pytest.mark.long),
         ("jitter", None, 0.01, 1e6, ""),  # of segments of 5 s, weighted by the window
         ("halves", 3, 0.02, 1e4, ""),
+        ("halves, weak", 3, 0.02, 1e4, ""),
         ("halves", 3, 0.02, 1e4, "octaves"),
         ("halves", 3, 0.02, 1e4, "reject"),
     ],

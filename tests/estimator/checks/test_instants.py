@@ -171,6 +171,22 @@ def test_play_or_a_dead_zone_beside_red_motion_is_found(kind: str, slope: float)
     assert {each.channel for each in dependences(rng, sensors)} == {3}
 
 
+def test_means_of_segments_move_a_dead_zone_in_lower_bands() -> None:
+    """What moves more slowly than a segment moves the motion through the dead zone."""
+    rng = np.random.default_rng(1)
+    below = np.fft.rfftfreq(N_SAMPLES, 1 / RATE)[:, None] < 3.0
+    sensors = [
+        np.fft.irfft(np.fft.rfft(each, axis=0) * below, axis=0) for each in bench(rng, 50.0, 3, 3)
+    ]
+    slow = 2 * np.sin(2 * np.pi * TIME / 97)[:, None]
+    sensors = [each + slow * each.std() for each in sensors]
+    x = sensors[1][:, 0]
+    x -= np.clip(x, -0.05 * x.std(), 0.05 * x.std())
+    lowest = min(dependences(rng, sensors), key=lambda each: each.band[1])
+    assert (lowest.channel, lowest.form) == (3, "curve")
+    assert lowest.band[1] < 3.0
+
+
 def test_short_gaps_that_are_filled_are_spikes_or_noise_where_motion_is_slow() -> None:
     rng = np.random.default_rng(4)
     sensors = bench(rng, 40.0, 3, 3)
