@@ -116,7 +116,7 @@ def changes(
             channel=change.channel,
             is_turn=change.is_turn,
             size=change.size,
-            size_error=change.error,
+            size_error=change.uncertainty,
             begin=change.begin,
             end=change.end,
             variance=float(stability.added[own].max()),

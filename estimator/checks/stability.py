@@ -626,7 +626,7 @@ def _also_by_band(
         added[channels] = of_motion[at, channels]
         size = math.sqrt(added[channels].max())
         span = float(edges[0][own[0]]), float(edges[1][own[-1]])
-        alike = response_change(band.responses, sensor, *time, 0)
+        alike = response_change(band.responses, sensor, *time, 0, kept=band.responses.kept)
         whole = float(time[0][0]), float(time[1][-1])
         found.append(replace(band.change(alike, whole, size), band=span))
     return tuple(found), added
@@ -691,7 +691,7 @@ def _changed(
         else:
             break
         own = total.without(taken)
-        change = response_change(own, sensor, begin, end, int(first[sensor]))
+        change = response_change(own, sensor, begin, end, int(first[sensor]), kept=total.kept)
         changes.append(change)
         added[first[sensor] : first[sensor + 1]] = variance_of_changes(own, sensor)
         second_order += SECOND_ORDER * chi * float(added[first[sensor] : first[sensor + 1]].max())

@@ -39,8 +39,8 @@ VALUES_AT_ONCE = 1 << 17
 """Values of the matrices of all parts that are regressed together: 2 MB."""
 SMALLEST_LEVEL = 1e-3
 """Of the noise of a part: estimates of few averages may be negative."""
-SHARES = (0.0, 0.25, 0.5, 0.75)
-"""Of a part, after which a step is looked for."""
+LINEAR, DATED = 0.4, 3e-3
+"""Errors of a size s: over s**2 (seen: .25 to .55 where .2 of the time is on one side), and s."""
 RAMP = 4
 """Parts of a ramp, at least."""
 ALIKE = 1e-6
@@ -388,6 +388,12 @@ class ResponseScores:
         return every
 
     @property
+    def kept(self) -> float:
+        """Share of a change that is seen: directions of each frequency follow its own averages."""
+        lost = [each.along.shape[2] / each.averages.sum() for each in self._pieces]
+        return max(1 - float(np.mean(lost)), 0.5)
+
+    @property
     def information(self) -> FloatArray:
         """Information of all sensors, shape (n_parts, n, n)."""
         if self._information is None:
@@ -557,6 +563,11 @@ class ResponseChange:
     degrees: float
     band: tuple[float, float] | None = None
 
+    @property
+    def uncertainty(self) -> float:
+        """Standard uncertainty of the size: of a linear fit, beside that of the date."""
+        return math.hypot(self.error, LINEAR * self.size**2, DATED * self.size)
+
 
 def patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
     """Return gains of all channels, of each, and turns: unit matrices, flattened."""
@@ -575,32 +586,50 @@ def patterns(d: int) -> list[tuple[int | None, bool, FloatArray]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Course:
-    """A step, or a ramp, of a response: from 0 to 1 over the parts, between two times."""
+    """A step, or a ramp, of a response over the parts, between two times.
+
+    `heights`, shape (n, n_parts), are fitted apart: one from 0 to 1; of a step within a part, that
+    of the parts behind it, and that of the part, which is a share of it.
+    """
 
     begin: float
     end: float
-    height: FloatArray
+    heights: FloatArray
+
+    def between(self, share: float) -> _Course:
+        """Return the step within a part after this share of it."""
+        at = self.begin + share * (self.end - self.begin)
+        return _Course(at, at, self.heights[:1] + (1 - share) * self.heights[1:])
 
 
 def _courses(begin: FloatArray, end: FloatArray) -> list[_Course]:
     """Return steps, also within parts, and ramps over several parts."""
     n, place, found = len(begin), np.arange(len(begin)), []
     for at in range(1, n):  # within the first part, any step is one at its end, and larger
-        for share in SHARES:  # of the part before the step
-            height = (place > at) + (1 - share) * (place == at)
-            time = float(begin[at] + share * (end[at] - begin[at]))
-            found.append(_Course(time, time, height))
+        first, last = float(begin[at]), float(end[at])
+        found.append(_Course(first, first, np.array([place >= at], np.float64)))
+        if at < n - 1:
+            found.append(_Course(first, last, np.array([place > at, place == at], np.float64)))
     for low in range(n - RAMP + 1):
         for high in range(low + RAMP, n + 1):
             height = np.clip((place - low + 0.5) / (high - low), 0, 1)
-            found.append(_Course(float(begin[low]), float(end[high - 1]), height))
+            found.append(_Course(float(begin[low]), float(end[high - 1]), height[None]))
     return found
 
 
 def response_change(
-    scores: ResponseScores, sensor: int, begin: FloatArray, end: FloatArray, first_channel: int
+    scores: ResponseScores,
+    sensor: int,
+    begin: FloatArray,
+    end: FloatArray,
+    first_channel: int,
+    *,
+    kept: float,
 ) -> ResponseChange:
-    """Return the one change of a sensor's response that explains most of its scores."""
+    """Return the one change of a sensor's response that explains most of its scores.
+
+    These have what is `kept` of it.
+    """
     score, information = scores.sensor(sensor)
     statistic, degrees = _chi_squared(score, information)
     d = scores.dims[sensor]
@@ -609,24 +638,33 @@ def response_change(
     size, error = 0.0, math.inf
     total = np.linalg.pinv(information.sum(axis=0), rcond=1e-9, hermitian=True)
     for each in courses:
-        c = each.height
+        c = each.heights
         # The mean of the response over the recording is that of the fit.
         own = np.tensordot(c, information, axes=1)
-        known = np.tensordot(c**2, information, axes=1) - own @ total @ own
+        known = np.tensordot(c[:, None] * c, information, axes=1) - own[:, None] @ total @ own
         along = c @ score
         for one in forms:
-            rows = one[2]
-            variance = np.linalg.pinv(rows @ known @ rows.T, hermitian=True)
-            found = variance @ (rows @ along)
-            gained = float(found @ (rows @ along)) - COST * len(rows)
-            gained -= COST if each.begin < each.end else 0.0
-            if gained > best + ALIKE:
-                best, pattern, course = gained, one, each
-                size = float(np.linalg.norm(found)) if one[1] else float(found[0])
-                error = math.sqrt(float(np.trace(variance)) / len(rows))
+            rows, here = one[2], each
+            n = len(rows)
+            matrix = (rows @ known @ rows.T).swapaxes(1, 2).reshape(len(c) * n, -1)
+            variance = np.linalg.pinv(matrix, hermitian=True)
+            gained = along @ rows.T
+            found = (variance @ gained.ravel()).reshape(gained.shape)
+            if len(c) > 1:
+                share = 1 - found[0] @ found[1] / max(found[0] @ found[0], 1e-300)
+                if not 0 < share < 1:
+                    continue
+                here = each.between(float(share))
+            gain = float((found * gained).sum()) - COST * n
+            gain -= COST if here.begin < here.end else 0.0
+            if gain > best + ALIKE:
+                best, pattern, course = gain, one, here
+                size = float(np.linalg.norm(found[0]) if one[1] else found[0, 0]) / kept
+                error = math.sqrt(float(np.trace(variance[:n, :n])) / n) / kept
     channel, is_turn, _ = pattern
     weight = np.einsum("kii->k", information)
-    before = 1 - size * float(weight @ course.height) / weight.sum()  # gains relative to the mean
+    height = float(weight @ course.heights[0]) / weight.sum()
+    before = 1 - size * height  # gains relative to the mean
     return ResponseChange(
         sensor=sensor,
         channel=None if channel is None else first_channel + channel,
