@@ -129,7 +129,9 @@ class RelativeResponse:
     angle_error_deg : float
         Standard error of both angles, from their scatter over parts of the band.
     rotation_error_deg : float
-        Standard error of the rotation, of its three components together.
+        Standard error of the rotation, of its three components together. Axes that are not at
+        right angles, and unequal gains of `first`, which look like them, make the rotation unclear
+        by as much.
     gains, gain_errors : float64, shape (d,)
         Gains of the channels of `second` over those of `first`, and their standard errors.
     nonorthogonality_deg : float
@@ -387,6 +389,7 @@ def _response(
     gain_errors = _jackknife(gains_without, gains)
     skew_errors = _jackknife(between_without, between)
     turned = _jackknife(np.rad2deg(_rotations(without)[0] - rotation), rotation)
+    skew, skew_error = float(np.abs(between).max()), float(np.linalg.norm(skew_errors))
     return RelativeResponse(
         first=sensors[0],
         second=sensors[1],
@@ -397,11 +400,13 @@ def _response(
         rotation_deg=rotation_deg,
         horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
         angle_error_deg=_angle_error(len(weight), left, right, without, horizontal),
-        rotation_error_deg=float(np.linalg.norm(turned) / math.sqrt(2)),
+        rotation_error_deg=math.hypot(
+            float(np.linalg.norm(turned) / math.sqrt(2)), math.sqrt(max(skew**2 - skew_error**2, 0))
+        ),
         gains=gains,
         gain_errors=gain_errors,
-        nonorthogonality_deg=float(np.abs(between).max()),
-        nonorthogonality_error_deg=float(np.linalg.norm(skew_errors)),
+        nonorthogonality_deg=skew,
+        nonorthogonality_error_deg=skew_error,
         reversed_channels=tuple(np.flatnonzero(is_reversed).tolist()),
         delay=delay,
         delay_error=delay_error,
@@ -552,11 +557,15 @@ def _parts(weight: FloatArray) -> IntArray:
 
 
 def _jackknife(without: FloatArray, like: FloatArray) -> FloatArray:
-    """Return standard errors from estimates that leave out one part each; NaN without any."""
+    """Return standard errors from estimates that leave out one part each; NaN without any.
+
+    They are of few parts: 1.96 of them are Student's interval of 95 % (expansion by Fisher).
+    """
     n = len(without)
     if not n:
         return np.full(like.shape, np.nan)
-    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1))
+    student = 1 + 1.21 / (n - 1) + 1.44 / (n - 1) ** 2
+    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1) * student)
 
 
 def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:

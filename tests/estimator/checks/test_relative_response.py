@@ -172,6 +172,27 @@ def test_noise_causes_no_bias_and_the_error_covers(peak: float) -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 3 * np.std(miss)
 
 
+def test_intervals_of_gains_and_delays_hold_the_truth_where_few_frequencies_weigh_most() -> None:
+    """The scatter of eight parts of the band is Student's: 90 % held it without."""
+    still = bench([np.eye(3)] * 3, snr=0.0)
+    red = 30 * (FREQUENCY / 5) ** -2.0
+    csm = still + red[:, None, None] * (bench([np.eye(3)] * 3, snr=1.0) - still)
+    held = []
+    for draw in wishart(csm, 40, np.random.default_rng(0), n_draws=200):
+        found = between(draw)
+        held.append(abs(found.delay) < 1.96 * found.delay_error)
+        held += (np.abs(found.gains - 1) < 1.96 * found.gain_errors).tolist()
+    assert 0.925 < np.mean(held) < 0.98
+
+
+def test_unequal_gains_of_the_first_sensor_are_in_the_error_of_the_rotation() -> None:
+    for seed in range(5):
+        turned = Rotation.random(random_state=seed)
+        found = between(bench([np.diag([1.1, 0.95, 1.0]), turned.as_matrix().T, np.eye(3)]))
+        off = abs(found.rotation_deg - np.rad2deg(turned.magnitude()))
+        assert found.reversed_channels or off < 2 * found.rotation_error_deg < 20
+
+
 @pytest.mark.parametrize(("dims", "snr", "every"), [((1, 1, 1), 5.0, 8), ((3, 3, 3), 7.0, 1)])
 def test_equal_sensors_in_weak_motion_are_not_said_to_differ(
     dims: tuple[int, ...], snr: float, every: int
