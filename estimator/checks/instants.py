@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.blocks import blocks
+from estimator.median import median
 from estimator.records import dataclass
 from estimator.types import ComplexArray, FloatArray, IntArray
 
@@ -30,6 +31,8 @@ Samples: TypeAlias = NDArray[np.floating[Any]]
 Form: TypeAlias = Literal["curve", "product", "gain", "instants", "filled", "spikes"]
 """Of what depends on the motion; "product": as that of two channels of a sensor; "filled": what is
 there where motion, or its slope, is small. Or "spikes": in single samples, as late or lost ones."""
+_Tested: TypeAlias = tuple[Form, float, FloatArray, FloatArray]
+"""Form, evidence from which it is certain, evidence and share, both of shape (n_channels,)."""
 WIDTH = 4.0
 """Highest frequency of a band over that of the next."""
 LEAST_BINS = 26
@@ -44,6 +47,12 @@ CERTAIN = 5.0
 """Evidence from which a channel depends on its motion."""
 BURSTS = 0.7
 """By which evidence of little play counts less: what leaks at edges of bursts looks like it."""
+SELDOM, STRONG = 3.5, 100.0
+"""Residual over its usual standard deviation, from which it is seldom so large; and power of motion
+over noise from which its sign is compared: weaker motion is predicted too small between spikes."""
+FEW = 4.0
+"""Evidence from which a channel depends on its motion in what is tested in one band alone: where
+its noise is seldom so large, and where two frequencies of the motion make a third."""
 PART = 0.4
 """Power that depends on the motion, over the most of any channel, from which a channel is named:
 a third sensor has a quarter of it in what others leave of it."""
@@ -132,8 +141,11 @@ def dependences(
             turn = np.exp(-2j * np.pi * past[:, own[0], None] * frequency).astype(np.complex64)
             motion, left = turn * motion, turn * left
         of_sensor = _Sensor(motion, left, means[:, own].T, frequency, window)
-        for number, band in enumerate(_bands(frequency, highest)):
-            clear = of_sensor.clearest(band, is_highest=number == 0)
+        bands = list(_bands(frequency, highest))
+        for band in bands:
+            clear = of_sensor.clearest(
+                band, is_highest=band is bands[0], is_lowest=band is bands[-1]
+            )
             found += [replace(one, channel=int(own[one.channel])) for one in clear]
     most = {each.band: 0.0 for each in found}
     for one in found:
@@ -212,7 +224,7 @@ class _Sensor:
     frequency: FloatArray
     window: FloatArray
 
-    def clearest(self, own: slice, *, is_highest: bool) -> Iterator[Dependence]:
+    def clearest(self, own: slice, *, is_highest: bool, is_lowest: bool) -> Iterator[Dependence]:
         """Yield what is clearest in a band of each channel, if it is clear."""
         felt, left = (np.mean(np.abs(e) ** 2, axis=1) for e in (self.motion, self.rest))
         there = left[:, own].sum(axis=1) / np.maximum(felt[:, own].sum(axis=1), _LEAST)
@@ -226,9 +238,6 @@ class _Sensor:
         x, slope = (course(each, everything) for each in (motion, turn * motion))
         r = _left(course(rest, own), x, course.edges * x, course.edges * slope)
         squares = x**2, slope**2
-        gain, of_gain = _of_loudness(r, squares[0])
-        instants, of_instants = _of_square(r, squares[1])
-        spikes = _of_spikes(r) if is_highest else np.zeros(len(tested))
         slopes = np.abs(turn[own]) ** 2
         of_slope = left[tested, own] @ slopes / np.maximum(felt[tested, own] @ slopes, _LEAST)
         ratios = there[tested], of_slope
@@ -236,29 +245,38 @@ class _Sensor:
         whole = (
             course(motion, slice(0, everything.stop)) + course.scale * self.means[tested, :, None]
         )
-        curve, of_curve = _clearest_curve(r, whole, bent)
         by_product, of_product, factors = _clearest_product(r, x, bent[0])
-        # all channels of a sensor are sampled at one instant; their residuals are not independent
-        instants = np.maximum(instants, TOGETHER * instants.sum() / np.sqrt(len(tested)))
-        forms: tuple[Form, ...] = ("gain", "instants", "product", "curve", "spikes")
-        of_share = CERTAIN * spikes / SPIKES
-        evidence = np.stack([np.abs(gain), np.abs(instants), by_product, curve, of_share])
-        shares = np.stack([of_gain, of_instants, of_product, of_curve, spikes])
-        band = float(self.frequency[own.start]), float(self.frequency[own.stop - 1])
-        for place, best in enumerate(evidence.argmax(axis=0).tolist()):
+        found: list[_Tested] = [
+            ("gain", CERTAIN, *_of_loudness(r, squares[0])),
+            ("instants", CERTAIN, *_of_instants(r, squares[1])),
+            ("product", CERTAIN, by_product, of_product),
+            ("curve", CERTAIN, *_clearest_curve(r, whole, bent)),
+        ]
+        if is_highest:
+            found += [_of_spikes(r), ("gain", FEW, *_seldom(r, x, there[tested]))]
+        if is_lowest:
+            found.append(("curve", FEW, *_coupled(rest, motion, min(own.stop, LEAST_BINS + 2))))
+        forms, limits, *values = zip(*found, strict=True)
+        limit, (evidence, shares) = np.array(limits), np.array(values)
+        certain = np.abs(evidence) / limit[:, None]
+        certain[np.ix_(limit == FEW, (certain[limit != FEW] >= 1).any(axis=0))] = 0.0
+        for place, best in enumerate(certain.argmax(axis=0).tolist()):
             channel, share, form, size = int(tested[place]), shares[best, place], forms[best], 0.0
             # what predictors explain by chance lacks where motion is large, in long waves
-            if evidence[best, place] < CERTAIN or (share < 0 and not is_highest):
+            if certain[best, place] < 1 or (share < 0 and not is_highest):
                 continue
             most = WITHIN_BAND * left[channel]
             if share < 0:
                 form = "filled"
             elif form in {"gain", "instants"}:
-                scale = np.mean(squares[0][place]) / np.mean(squares[best][place])
+                scale = np.mean(squares[0][place]) / np.mean(squares[form == "instants"][place])
                 size = float(np.sqrt(share * there[channel] * scale))
             share = min(abs(share), 1.0)
-            clear = np.abs(shares[evidence[:, place] >= CERTAIN, place])
-            if form == "product" and factors[0] is factors[1]:
+            if (
+                form == "curve" and limit[best] == FEW
+            ):  # sums of frequencies up to the highest of the band
+                most = np.where(np.arange(len(most)) < 2 * own.stop, most, 0.0)
+            elif form == "product" and factors[0] is factors[1]:
                 form = "curve"  # a part of what bends: the square of its integral, say
             elif form == "product":
                 alike = course.power(factors[0] * factors[1]) / np.maximum(left[channel], _LEAST)
@@ -270,12 +288,13 @@ class _Sensor:
                 most = np.minimum(WITHIN_BAND * alike, most)
             yield Dependence(
                 channel=channel,
-                band=band,
+                band=(float(self.frequency[own.start]), float(self.frequency[own.stop - 1])),
                 form=form,
-                evidence=float(evidence[best, place]),
+                evidence=float(abs(evidence[best, place])),
                 size=size,
                 explained=most.astype(np.float64),
-                power=float(min(clear.max(), 1.0) * there[channel]),
+                power=min(float(np.abs(shares[certain[:, place] >= 1, place]).max()), 1.0)
+                * float(there[channel]),
             )
 
 
@@ -339,12 +358,13 @@ def _evidence(along: FloatArray) -> FloatArray:
     return np.asarray(np.copysign(normal, t))
 
 
-def _of_spikes(r: Samples) -> FloatArray:
-    """Return the share of noise that is in few samples, shape (n_channels,)."""
+def _of_spikes(r: Samples) -> _Tested:
+    """Return the share of noise that is in few samples, shape (n_channels,), as evidence."""
     power = r.reshape(len(r), -1) ** 2
     few = max(1, round(RARE * power.shape[1]))
     highest = np.partition(power, power.shape[1] - few, axis=1)[:, -few:]
-    return np.asarray(highest.sum(axis=1) / np.maximum(power.sum(axis=1), _LEAST))
+    share = highest.sum(axis=1) / np.maximum(power.sum(axis=1), _LEAST)
+    return "spikes", CERTAIN, CERTAIN * share / SPIKES, share
 
 
 def _bent(ratio: FloatArray, square: Samples) -> FloatArray:
@@ -369,6 +389,82 @@ def _of_loudness(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
     lasting = _of_square(r[..., LASTS // 2 + 1 : -(LASTS // 2)], around)
     lasts = lasting[0] > np.abs(found[0])
     return np.where(lasts, lasting[0], found[0]), np.where(lasts, lasting[1], found[1])
+
+
+def _seldom(r: Samples, x: Samples, ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of seldom large noise with a sign of the motion, (n_channels,).
+
+    As of a gain that is another one at times. Signs of pieces are as likely plus as minus where
+    noise knows nothing of the motion, however it is distributed. But a spike of another sensor is
+    in what is predicted, with the opposite sign, and one of its own in what is recorded. `ratio`:
+    power of the noise over that of the motion.
+    """
+    usual = median(np.abs(r).reshape(len(r), -1).T)[:, None, None] / 0.6745
+    large = np.where(np.abs(r) > SELDOM * usual, r, 0.0)
+    x, unit = (
+        each / np.sqrt(np.maximum(np.mean(each**2, axis=(1, 2), keepdims=True), _LEAST))
+        for each in (x, r)
+    )
+    n_pieces, evidence = r.shape[2] // PIECE, []
+    for sign, felt in ((1, x), (-1, x + np.sqrt(ratio)[:, None, None] * unit)):
+        along = sign * np.sign(large) * np.clip(felt, -1, 1)
+        pieces = along[..., : n_pieces * PIECE].reshape(len(r), -1, PIECE).sum(axis=2)
+        scatter = np.sqrt(np.maximum(np.sum(pieces**2, axis=1), _LEAST))
+        evidence.append(pieces.sum(axis=1) / scatter)
+    share = np.sum(large**2, axis=(1, 2)) / np.maximum(np.sum(r**2, axis=(1, 2)), _LEAST)
+    return np.where(ratio < 1 / STRONG, np.max(evidence, axis=0), 0.0), share
+
+
+def _coupled(
+    rest: NDArray[np.complex64], motion: NDArray[np.complex64], top: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise at sums and differences of frequencies of the motion.
+
+    A square of whatever follows from the motion, as a displacement does, at any distance in time.
+    """
+    x = motion[..., :top] / np.sqrt(
+        np.maximum(np.mean(np.abs(motion[..., :top]) ** 2, axis=1, keepdims=True), _LEAST)
+    )
+    at = np.arange(2, top)
+    first, second = (each.ravel() for each in np.meshgrid(np.arange(1, top), at, indexing="ij"))
+    below = 2 * first <= second
+    above = first + second < top
+    sums = rest[..., second[below]].conj() * x[..., first[below]] * x[..., (second - first)[below]]
+    sums[..., (2 * first == second)[below]] /= np.sqrt(2)  # of a square of one frequency
+    differences = (
+        rest[..., second[above]].conj()
+        * x[..., (first + second)[above]]
+        * x[..., first[above]].conj()
+    )
+    both = np.concatenate([sums, differences], axis=2)
+    gram = (both @ both.conj().swapaxes(1, 2)).real
+    evidence, more = _by_signs(np.asarray(gram, np.float64))
+    return evidence, more / (rest.shape[1] ** 2 * len(at))
+
+
+def _by_signs(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return evidence that the sum over segments is not 0, and its square beyond the expected one.
+
+    By products of segments, (n_channels, n_segments, n_segments). Where signs of segments are as
+    likely plus as minus, it has the mean and the variance below, and close to a chi-squared
+    distribution.
+    """
+    own = np.einsum("css->cs", gram)
+    total, expected = gram.sum(axis=(1, 2)), own.sum(axis=1)
+    variance = 2 * (np.sum(gram**2, axis=(1, 2)) - np.sum(own**2, axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = variance / (9 * expected**2)  # of the cube root (Wilson and Hilferty)
+        evidence = (np.cbrt(total / expected) - (1 - spread)) / np.sqrt(spread)
+    return np.where(variance > 0, evidence, 0.0), np.maximum(total - expected, 0.0)
+
+
+def _of_instants(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
+    """Return evidence and share of noise whose power follows the square of the slope.
+
+    All channels of a sensor are sampled at one instant; their residuals are not independent.
+    """
+    found, share = _of_square(r, square)
+    return np.maximum(found, TOGETHER * found.sum() / np.sqrt(len(found))), share
 
 
 def _clearest_curve(
@@ -439,8 +535,7 @@ def _of_square(r: Samples, square: Samples) -> tuple[FloatArray, FloatArray]:
 def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:
     """Return evidence and share of noise with a mean that is a curve of x, shape (n_channels,).
 
-    A straight line is none. Where signs of segments are as likely plus as minus, the sum over cells
-    has the mean and the variance below, and close to a chi-squared distribution.
+    A straight line is none.
     """
     shape = n_channels, n, _ = r.shape
     x = x / np.sqrt(np.maximum(np.mean(x**2, axis=(1, 2), keepdims=True), _LEAST))
@@ -458,12 +553,5 @@ def _curve(r: Samples, x: Samples) -> tuple[FloatArray, FloatArray]:
     basis, _ = np.linalg.qr(np.stack([size * used, line * used], axis=2))
     sums = sums * scale[:, None]
     sums -= (sums @ basis) @ basis.swapaxes(1, 2)
-    gram = sums @ sums.swapaxes(1, 2)
-    own = np.einsum("css->cs", gram)
-    total, expected = gram.sum(axis=(1, 2)), own.sum(axis=1)
-    variance = 2 * (np.sum(gram**2, axis=(1, 2)) - np.sum(own**2, axis=1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        spread = variance / (9 * expected**2)  # of the cube root (Wilson and Hilferty)
-        evidence = (np.cbrt(total / expected) - (1 - spread)) / np.sqrt(spread)
-    share = np.maximum(total - expected, 0.0) / np.sum(r**2, axis=(1, 2))
-    return np.where(variance > 0, evidence, 0.0), share
+    evidence, more = _by_signs(np.asarray(sums @ sums.swapaxes(1, 2), np.float64))
+    return evidence, more / np.sum(r**2, axis=(1, 2))

@@ -44,7 +44,7 @@ def dependences(
 ) -> list[Dependence]:
     samples = np.hstack([each + rng.standard_normal(each.shape) for each in sensors])
     tested = SquaresAndCubes(WELCH, 47.0)
-    for segment in samples.reshape(MOST_SEGMENTS, WELCH.segment_length, -1):
+    for segment in samples.reshape(-1, WELCH.segment_length, samples.shape[1]):
         tested.add(segment, np.repeat(past, samples.shape[1] // len(past)))
     return tested.dependences(np.repeat(np.arange(len(sensors)), sensors[0].shape[1]))
 
@@ -119,7 +119,6 @@ def test_a_product_of_two_axes_is_in_its_channel() -> None:
         ("play", 38.0, 0.005),
         ("play", 20.0, 0.1),
         ("steps of a converter", 60.0, 2e-3),
-        ("square of a displacement", 60.0, 2e-3),
     ],
 )
 def test_what_bends_otherwise_is_a_curve(kind: str, ratio: float, size: float) -> None:
@@ -130,14 +129,43 @@ def test_what_bends_otherwise_is_a_curve(kind: str, ratio: float, size: float) -
     sensors[0][:, 1] = with_play(x, size * x.std())
     if kind == "steps of a converter":
         sensors[0][:, 1] = x + size * x.std() * np.sin(4 * np.pi * x / x.std())
-    if kind == "square of a displacement":
-        integral = signal.butter(2, 1.0, "high", fs=RATE, output="sos")
-        far = signal.sosfilt(integral, np.cumsum(signal.sosfilt(integral, np.cumsum(x))))
-        sensors[0][:, 1] = x + size * x.std() * far**2 / far.var()
     found = dependences(rng, sensors)
     assert {(each.channel, each.form) for each in found} == {(1, "curve")}
     assert not found[0].size
     assert np.median(found[0].explained) > 4 * 2 / RATE  # all of the noise may be of the motion
+
+
+@pytest.mark.parametrize(("ratio", "corner"), [(40.0, 0.3), (60.0, 0.3), (60.0, 1.0)])
+@pytest.mark.parametrize("times", [1, 2])
+def test_the_square_of_an_integral_is_found_in_30_segments(
+    ratio: float, corner: float, times: int
+) -> None:
+    """A displacement, or a velocity, is of few frequencies: it has few independent values."""
+    rng = np.random.default_rng(9)
+    sensors = bench(rng, ratio, 3, 3)
+    far = x = sensors[0][:, 1]
+    for _ in range(times):
+        integral = signal.butter(2, corner, "high", fs=RATE, output="sos")
+        far = signal.sosfilt(integral, np.cumsum(far))
+    square = 2e-3 * x.std() * far**2 / far.var()
+    sensors[0][:, 1] = x + square
+    found = dependences(rng, [each[: 30 * WELCH.segment_length] for each in sensors])
+    assert {each.channel for each in found} == {1}
+    frequency, added = signal.welch(square, RATE, nperseg=WELCH.segment_length)
+    here = (frequency > 2 * corner) & (frequency < 3 * corner)
+    curve = next(each for each in found if each.form == "curve")
+    assert curve.explained[here].sum() > added[here].sum()
+
+
+def test_a_gain_that_is_another_one_after_large_motion_is_found() -> None:
+    """A digitizer whose range is larger for .5 s: it is seldom the small one."""
+    rng = np.random.default_rng(10)
+    sensors = bench(rng, 60.0, 3, 3)
+    x = sensors[1][:, 0]
+    large = np.convolve(np.abs(x) > 1.8 * x.std(), np.ones(50))[: len(x)] > 0
+    sensors[1][:, 0] = x * np.where(large, 1.005, 1.0)
+    found = dependences(rng, sensors)
+    assert {(each.channel, each.form) for each in found} == {(3, "gain")}
 
 
 @pytest.mark.parametrize("most", [1.0, 1.5])
