@@ -436,9 +436,12 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
         first, *_ = of_sensor
         if sensor in much:
             continue
-        inside = slice(int(edges[0]), int(edges[-1]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            most = [median(e.most[inside] / noise[inside, e.column]) for e in of_sensor]
+        most = []
+        for one in of_sensor:  # in its band, which may be small
+            low, high = np.clip(np.searchsorted(snapshot.frequency, one.band), *edges[[0, -1]])
+            here = slice(int(low), int(max(high, low + 1)))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                most.append(median(one.most[here] / noise[here, one.column]))
         yield NoiseDependsOnMotion(
             rank=Rank.TO_KNOW if max(most) <= MUCH_NONLINEAR else Rank.DELAYS,
             sensors=(sensor,),

@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from daq.estimation.estimation import estimate
 from daq.estimation.segments.segment_pass import Pass
@@ -85,6 +86,29 @@ def test_instants_that_sway_are_in_the_interval() -> None:
     assert found.mean[2, 3:6].min() > 3 * truth
     assert ((low < truth) & (truth < high))[:, 3:6].all()
     assert np.isfinite(low[:, :3]).all()
+
+
+def test_the_square_of_a_displacement_delays_the_result_of_its_few_frequencies() -> None:
+    rng = np.random.default_rng(48)
+    motion = 1e3 * rng.standard_normal((N_SAMPLES, 3))
+    far, slow = motion[:, 0], signal.butter(2, 0.3, "high", fs=RATE, output="sos")
+    for _ in range(2):
+        far = signal.sosfilt(slow, np.cumsum(far))
+    bent = motion.copy()
+    bent[:, 0] += 2e-3 * motion[:, 0].std() * far**2 / far.var()
+    arrays = {
+        name: each @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + rng.standard_normal(each.shape)
+        for name, each in {"A": motion, "C": motion}.items()
+    }
+    arrays["B"] = bent + rng.standard_normal(bent.shape)
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings())
+    result = Result(snapshot, Settings())
+    (fact,) = (each for each in result.facts if isinstance(each, NoiseDependsOnMotion))
+    assert (fact.channels, fact.rank) == (("B.1",), Rank.DELAYS)
+    edges = np.searchsorted(snapshot.frequency, [0.6, 1.0])
+    found = result.spectrum(result.method).levels(edges)
+    assert found.mean[0, 6] > 30 * 2 / RATE
+    assert found.ends()[0][0, 6] < 2 / RATE
 
 
 @pytest.mark.parametrize("form", get_args(Form))
