@@ -323,6 +323,9 @@ class Equalisation:
         share = np.concatenate([_unseen(band) for band in bands])[:, None]
         unseen = share * np.maximum(whole.left, 0.0) * (self.filters is not None)
         unseen += _FROM_AFAR * np.maximum(found.left, 0.0) * self._jumps
+        unseen += np.concatenate(
+            [_of_trends(*each) for each in zip(bands, found.noise, strict=True)]
+        )
         with np.errstate(divide="ignore", invalid="ignore"):  # responses vanish at 0 Hz
             return EdgeLeakage(
                 left=found.left * scale,
@@ -417,6 +420,28 @@ class Equalisation:
             left = np.where(hidden & (least > 0).any(axis=0), np.fmax(left, np.abs(noise)), left)
             parts.append((motion, left, least))
         return _Leaks(noise_of_bands, *map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _of_trends(band: Band, result: SelfNoise) -> FloatArray:
+    """Return what trends of the noise within segments leak, shape (n_freqs, n_channels).
+
+    As much as if what the lowest two known frequencies have beyond others near them were of trends.
+    """
+    noise, welch = np.nan_to_num(result.noise_psd), band.settings
+    known = np.flatnonzero(np.isfinite(result.noise_psd).any(axis=1) & (band.frequencies > 0))
+    length = welch.segment_length
+    lines = np.rint(band.frequencies * length / welch.sampling_rate).astype(np.int64)
+    first = int(np.searchsorted(lines[known], 3 * lines[known[:1]].sum()))
+    near = known[first : 2 * first + 1]
+    if not len(near):
+        return np.zeros(noise.shape)
+    trend = np.linspace(-1.0, 1.0, length)
+    if welch.detrend == "linear":
+        trend = trend**2 - np.mean(trend**2)
+    trend *= get_window(welch.window, length)
+    leaks = np.abs(np.fft.rfft(trend)[lines]) ** 2
+    low, rest = (noise[some].mean(axis=0) for some in (known[:2], near))
+    return np.asarray(leaks[:, None] / leaks[known[:2]].mean() * np.maximum(low - rest, 0.0))
 
 
 def _by_all_others(band: Band, dims: tuple[int, ...]) -> SelfNoise | None:

@@ -80,7 +80,8 @@ class EdgeLeakage:
     whole : float64, shape (n_freqs, n_channels)
         The same without equalisation.
     unseen : float64, shape (n_freqs, n_channels)
-        What equalisation may have left that averages do not show, or windows that jump; likewise.
+        What equalisation may have left that averages do not show, windows that jump, or trends of
+        the noise within segments; likewise.
     share, whole_share : float64, shape (n_freqs, n_channels)
         What the first two are at least, over the noise estimate, in bands of third octaves.
     sources : tuple of str

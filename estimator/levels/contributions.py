@@ -32,7 +32,7 @@ class Source(enum.StrEnum):
     CLOCKS = "clocks"
     """The residual between the clocks adds noise, or takes it away."""
     EDGES = "edges"
-    """Unequal responses leak at the edges of segments."""
+    """Unequal responses, or drifts of the noise, leak at the edges of segments."""
     GAPS = "gaps"
     """The windows of segments with gaps leak from other frequencies."""
     MISFIT = "misfit"

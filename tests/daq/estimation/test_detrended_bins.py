@@ -75,3 +75,29 @@ def test_the_lowest_level_is_that_of_the_noise(detrend: str, slope: float) -> No
     low, high = found.ends(3.5)
     assert found.of_scatter.complete.all()
     assert ((low < truth) & (truth < high)).all()
+
+
+@pytest.mark.parametrize(("detrend", "power", "size"), [("constant", 1, 1e4), ("linear", 2, 3e6)])
+def test_what_drifts_within_segments_leak_is_in_the_interval(
+    detrend: str, power: int, size: float
+) -> None:
+    """A drift has no noise at these frequencies: it leaks there through the window."""
+    rng, n_samples = np.random.default_rng(8), 100 * LENGTH
+    motion = 10.0 * rng.standard_normal((n_samples, 1))
+    arrays = {name: motion + rng.standard_normal((n_samples, 1)) for name in "ABC"}
+    arrays["B"][:, 0] += size * np.linspace(-1, 1, n_samples) ** power
+    settings = Settings(
+        segment=LENGTH / RATE,
+        detrend=detrend,  # type: ignore[arg-type]  # of the parameters
+        axis_tolerance={"": 0.0},
+    )
+    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], settings)
+    noise = next(iter(snapshot.results.values()))
+    edges = np.searchsorted(snapshot.frequency, [3.5 * RATE / LENGTH, 6.5 * RATE / LENGTH, 20.0])
+    found = Spectrum(noise, snapshot, settings).levels(edges)
+    low, high = found.ends()
+    truth = 2 / RATE
+    assert found.mean[0, 1] > 2 * truth
+    assert (low < truth).all()
+    assert (high > truth).all()
+    assert low[1].min() > 0.8 * truth  # nothing is added where a drift leaks little
