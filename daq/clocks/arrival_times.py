@@ -149,6 +149,7 @@ _LIKELY = 2.0  # standard deviations
 _FAR_OFF = 6.0  # standard deviations, beyond which a measured delay is not on the clock
 _SEEN_AS = 1e-6  # seconds; the least of these standard deviations
 _SCATTER = 1.5  # stated deviations of measured delays, to which they may scatter of themselves
+_TELLS = 10.0  # usual variances of a delay, beyond which it tells nothing of a clock's error
 _LEAST_DELAYS = 40
 _OUTWEIGHED = 0.05  # share of arrivals in what is known of a clock
 _EVERYWHERE = 8.0  # times the usual distance of delays, beyond which there are none
@@ -794,6 +795,7 @@ def _guarded(
         is_understood = float(off.mean()) <= _A_FEW
         certain = np.sqrt(variance) < _WELL_KNOWN / sampling_rate  # these are hardly ever false
         used = ~off | certain if is_understood else np.ones(len(off), np.bool_)
+        used &= variance <= _TELLS * median(variance)
         excess = float(np.mean(late_by[used] ** 2 - _SCATTER**2 * variance[used]))
         residual = max(residual, math.sqrt(max(excess, agreement(late_by[used]))))
     if abs(state.ppm) - _CERTAIN * state.ppm_std > _OSCILLATOR:

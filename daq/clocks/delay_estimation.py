@@ -10,8 +10,14 @@ The delay of sensor j against this prediction, within one segment, is the τ tha
 
 This is least squares weighted by the residuals of the prediction: frequencies without coherent
 signal have no weight. The maximum is searched for on a grid and refined by Newton's method. Its
-variance is ``κ / (2 s² Σ ω² (P X_0)^H R^-1 P X_0)``, where κ accounts for the correlation of
-neighbouring frequencies by the window, and s is the share of the sum that is not noise of P.
+variance is ``κ / 2 Σ ω² (P X_0)^H R^-1 P X_0 / C²``, where κ accounts for the correlation of
+neighbouring frequencies by the window, and C is the curvature of J, at most the share of the sum
+that is not noise of P.
+
+Where responses differ, what a window cuts off of a loud moment at its edge is not what P predicts
+of it. To first order in the length of responses it is ``i/2π dP/df D``, with D the spectrum of the
+reference under the window's derivative: this is part of the prediction. Without it a burst at the
+edge of a segment looks like a delay.
 
 P is averaged over segments after correction of their delays. The first batch of segments with
 motion does this by iteration and thereby defines a frame; later batches are measured in that frame,
@@ -24,6 +30,7 @@ The reference is the first sensor, unless another sensor shares the motion with 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Self
@@ -57,6 +64,7 @@ _MET = 0.3  # share of the predicted motion that a peak explains
 _CLEAR = 1.5  # ratio to the peak nearest zero: the peaks of one line are about equal
 _OUTSTANDING = 2.0  # ratio to all peaks within _LONGEST: noise reaches at most 1.5
 _FREQUENCIES_AT_ONCE = 1024
+_SLOPE = 3  # frequencies on either side, from which the slope of P is known
 _RIDGE = 1e-10  # fraction of the mean power: keeps matrices regular with a dead channel
 
 
@@ -174,8 +182,7 @@ class DelayEstimator:
         """
         if not self._is_enough(len(spectra)):
             return self._unknown(len(spectra))
-        used = spectra[:, 1 : len(self.omega) + 1].swapaxes(0, 1)
-        return self._measured([np.ascontiguousarray(used[:, :, one]) for one in self.columns])
+        return self._measured(spectra[:, :, one] for one in self.columns)
 
     @property
     def fewest(self) -> int:
@@ -189,20 +196,27 @@ class DelayEstimator:
         shape = (n_segments, len(self.columns))
         return np.full(shape, np.nan), np.full(shape, np.inf)
 
-    def _measured(self, sensors: list[ComplexArray]) -> tuple[FloatArray, FloatArray]:
-        """Measure delays from the spectra of each sensor, (n_freqs, n_segments, n_channels)."""
+    def _measured(self, spectra: Iterable[ComplexArray]) -> tuple[FloatArray, FloatArray]:
+        """Measure delays from the spectra of each sensor, (n_segments, n_freqs, n_channels)."""
+        references = (self._reference,) if self.has_frame else tuple(range(self.n_candidates))
+        sensors: list[ComplexArray] = []
+        edges: dict[int, ComplexArray] = {}
+        for number, each in enumerate(spectra):
+            if number in references:
+                edges[number] = self._used(self._at_edges(each))
+            sensors.append(self._used(each))
         n_segments = sensors[0].shape[1]
         delays, std = self._unknown(n_segments)
         if self.has_frame:
-            x0 = sensors[self._reference]
+            x0, d0 = sensors[self._reference], edges[self._reference]
             found = {
-                number: self._delays(frame, x0, sensors[number])
+                number: self._delays(frame, (x0, d0), sensors[number])
                 for number, frame in self._frames.items()
             }
         else:
             self.has_tried = True
-            self._reference, found = self._with_reference(sensors)
-            x0 = sensors[self._reference]
+            self._reference, found = self._with_reference(sensors, edges)
+            x0, d0 = sensors[self._reference], edges[self._reference]
             if not any(np.isfinite(spread).any() for _, spread in found.values()):
                 return delays, std
         delays[:, self._reference] = std[:, self._reference] = 0.0
@@ -215,6 +229,8 @@ class DelayEstimator:
                 used = known if enough else np.ones(n_segments, dtype=bool)
                 advanced = self._advanced(xj[:, used], np.where(known, tau, 0.0)[used])
                 new = _Frame.of(x0[:, used], advanced)
+                if frame or enough:  # else P is not regular
+                    new = _Frame.of(x0[:, used], advanced - self._cut(frame or new, d0[:, used]))
                 if frame is None:
                     self._frames[number] = new
                 else:
@@ -223,7 +239,7 @@ class DelayEstimator:
         return delays, std
 
     def _with_reference(
-        self, sensors: list[ComplexArray]
+        self, sensors: list[ComplexArray], edges: dict[int, ComplexArray]
     ) -> tuple[int, dict[int, tuple[FloatArray, FloatArray]]]:
         """Return the reference, and the others' delays and standard deviations against it."""
         best: tuple[int, dict[int, tuple[FloatArray, FloatArray]]] = (0, {})
@@ -231,7 +247,7 @@ class DelayEstimator:
         for reference, x0 in enumerate(sensors[: self.n_candidates]):
             power = _products(x0, x0)
             found = {
-                number: self._first_delays(x0, xj, power)
+                number: self._first_delays((x0, edges[reference]), xj, power)
                 for number, xj in enumerate(sensors)
                 if number != reference
             }
@@ -244,20 +260,23 @@ class DelayEstimator:
         return best
 
     def _first_delays(
-        self, x0: ComplexArray, xj: ComplexArray, power: ComplexArray
+        self, reference: tuple[ComplexArray, ComplexArray], xj: ComplexArray, power: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
         """Measure delays and the frame of these segments, by iteration.
 
-        `power` is the sum of the products of x0.
+        `power` is the sum of the products of the reference.
         """
+        x0, d0 = reference
+        cut = np.zeros_like(xj)
         tau, spread = np.zeros(x0.shape[1]), np.full(x0.shape[1], np.inf)
         if not self._moves(_Frame.of(x0, xj, power)):
             return tau + np.nan, spread
         is_last = False
         for number in range(_FIRST_ITERATIONS):
-            before, frame = tau, _Frame.of(x0, self._advanced(xj, tau), power)
+            before, frame = tau, _Frame.of(x0, self._advanced(xj, tau) - cut, power)
             # At first P is a mean over unknown delays, and its peaks are low.
-            tau, spread = self._delays(frame, x0, xj, doubt_cycles=is_last)
+            tau, spread = self._delays(frame, reference, xj, doubt_cycles=is_last)
+            cut = self._cut(frame, d0)
             is_still = np.isnan(tau)
             tau = np.where(np.isfinite(spread), tau, 0.0)
             tau -= tau.mean()
@@ -295,33 +314,58 @@ class DelayEstimator:
             np.linalg.norm((np.nan_to_num(weight)[:, None, None] * response * turned).sum(0))
         )
 
-    def _spectra(self, samples: FloatArray, starts: IntArray) -> list[ComplexArray]:
-        """Return the spectra of each sensor, shape (n_freqs, n_segments, n_channels)."""
-        length, end = len(self.window), len(self.omega) + 1
-        frames = np.lib.stride_tricks.sliding_window_view(samples, length, axis=0)
-        spectra = []
+    def _spectra(self, samples: FloatArray, starts: IntArray) -> Iterator[ComplexArray]:
+        """Yield the spectra of each sensor, shape (n_segments, n_freqs, n_channels)."""
+        frames = np.lib.stride_tricks.sliding_window_view(samples, len(self.window), axis=0)
         for columns in self.columns:  # one by one, to bound memory
             own = frames[:, columns][starts]
             own -= own.mean(axis=-1, keepdims=True)
             own *= self.window
-            found = np.fft.rfft(own, axis=-1)[:, :, 1:end].transpose(2, 0, 1)
-            spectra.append(np.ascontiguousarray(found))  # makes products fast
-        return spectra
+            yield np.fft.rfft(own, axis=-1).swapaxes(1, 2)
+
+    def _used(self, spectra: ComplexArray) -> ComplexArray:
+        """Return spectra at the frequencies used, (n_freqs, n_segments, n_channels)."""
+        used = spectra[:, 1 : len(self.omega) + 1].swapaxes(0, 1)
+        return np.ascontiguousarray(used)  # makes products fast
+
+    def _at_edges(self, spectra: ComplexArray) -> ComplexArray:
+        """Return spectra under the window's derivative, per s, from those under the window."""
+        window, n = self.window, len(self.window)
+        slope = (np.roll(window, -1) - np.roll(window, 1)) * self.sampling_rate / 2
+        ratio = np.where(window > 0, slope, 0.0) / np.where(window > 0, window, 1.0)
+        return np.fft.rfft(np.fft.irfft(spectra, n, axis=1) * ratio[:, None], axis=1)
+
+    def _cut(self, frame: _Frame, d0: ComplexArray) -> ComplexArray:
+        """Return what the edges of segments add to the prediction by P, of the shape of xj."""
+        return _by(d0, self._slope(_prediction(frame)[0]))
+
+    def _slope(self, response: ComplexArray) -> ComplexArray:
+        """Return ``i/2π dP/df`` in s, by lines through neighbouring frequencies."""
+        n, step = len(response), self.sampling_rate / len(self.window)
+        padded = np.pad(response, ((_SLOPE, _SLOPE), (0, 0), (0, 0)), mode="edge")
+        lags = range(1, _SLOPE + 1)
+        total = sum(k * (padded[_SLOPE + k :][:n] - padded[_SLOPE - k :][:n]) for k in lags)
+        return np.asarray(total * (0.5j / (2 * np.pi * step * sum(k**2 for k in lags))))
 
     def _advanced(self, spectra: ComplexArray, tau: FloatArray) -> ComplexArray:
         return np.asarray(spectra * _turn(self.omega, tau)[:, :, None])
 
     def _delays(
-        self, frame: _Frame, x0: ComplexArray, xj: ComplexArray, *, doubt_cycles: bool = True
+        self,
+        frame: _Frame,
+        reference: tuple[ComplexArray, ComplexArray],
+        xj: ComplexArray,
+        *,
+        doubt_cycles: bool = True,
     ) -> tuple[FloatArray, FloatArray]:
         """Measure delays in a frame, shapes (n_segments,): the maxima of J.
 
         `doubt_cycles`: whether peaks that are equal but for noise count as equal.
         """
-        omega = self.omega
+        omega, (x0, d0) = self.omega, reference
         response, left = _prediction(frame)
         weight = np.linalg.inv(left)
-        predicted = np.matmul(x0, response.transpose(0, 2, 1))
+        predicted = _by(x0, response) + _by(d0, self._slope(response))
         weighted = np.matmul(predicted.conj(), weight)
         crossed = np.einsum("fsp,fsp->fs", weighted, xj)
         energy = np.einsum("fsp,fsp->fs", weighted, predicted).real
@@ -333,11 +377,15 @@ class DelayEstimator:
         spurious = self._spurious(frame)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.maximum(1 - spurious / informative.mean(), 0.0)
-            std = np.sqrt(kappa / (2 * informative)) / share
             alike = _ALIKE * np.sqrt(kappa / total) / share
         alike = np.minimum(np.nan_to_num(alike, nan=1.0), 1.0) * doubt_cycles
         tau, is_one = self._peak(crossed, alike)
-        met = (crossed * _turn(omega, tau)).real.sum(axis=0)
+        turned = (crossed * _turn(omega, tau)).real
+        met = turned.sum(axis=0)
+        # Where a segment is quiet, P predicts the reference's noise, which says nothing of a delay.
+        curvature = np.minimum(omega**2 @ turned, share * informative)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = np.sqrt(kappa * informative / 2) / np.maximum(curvature, 0.0)
         # R is an estimate too: correct by the mean of an inverse Wishart matrix.
         freedom = max(frame.n_segments - x0.shape[2], 1)
         inflated = freedom / max(freedom - xj.shape[2] - 1, 1)
@@ -481,6 +529,11 @@ def _turn(omega: FloatArray, tau: FloatArray) -> ComplexArray:
     coarse = np.exp(1j * omega[0] * block * np.outer(np.arange(count), tau))
     turned = coarse[:, None] * fine[None]
     return np.asarray(turned.reshape(count * block, len(tau))[: len(omega)])
+
+
+def _by(x0: ComplexArray, response: ComplexArray) -> ComplexArray:
+    """Return spectra (n_freqs, n_segments, n) times responses (n_freqs, m, n)."""
+    return np.asarray(np.matmul(x0, response.transpose(0, 2, 1)))
 
 
 def _products(a: ComplexArray, b: ComplexArray) -> ComplexArray:

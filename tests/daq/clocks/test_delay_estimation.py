@@ -50,6 +50,49 @@ def test_known_delays_are_measured_within_their_stated_error() -> None:
     assert np.median(std[:, 1]) < 2e-5
 
 
+def z_of(motion: FloatArray, felt: FloatArray, noise: float, seed: int) -> FloatArray:
+    """Return delays that are none, over their stated deviations."""
+    rng = np.random.default_rng(seed)
+    samples = np.hstack([motion, felt])
+    samples += noise * rng.standard_normal(samples.shape)
+    meter = DelayEstimator(RATE, WINDOW, COLUMNS, hop=HOP)
+    starts = np.arange((len(motion) - LENGTH) // HOP + 1) * HOP
+    batches = [meter.measure(samples, starts[first : first + 40]) for first in (0, 40, 80)]
+    measured, std = (np.concatenate([each[n] for each in batches])[:, 1] for n in (0, 1))
+    known = np.isfinite(std)
+    assert known.mean() > 0.9
+    return np.asarray((measured[known] - np.median(measured[known])) / std[known])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bursts_at_the_edges_of_segments_are_no_delay_where_responses_differ(seed: int) -> None:
+    """Without what the edges add, delays are off by up to 18 stated deviations."""
+    rng = np.random.default_rng([18, seed])
+    n = 119 * HOP + LENGTH
+    loud = np.zeros(n)
+    loud[rng.integers(0, n, 60)] = rng.uniform(0.5, 3.0, 60)
+    decay = np.exp(-np.arange(LENGTH) / 30)
+    motion = rng.standard_normal((n, 2)) * (np.convolve(loud, decay)[:n, None] + 0.03)
+    frequency = np.fft.rfftfreq(n, 1 / RATE)[:, None]
+    resonance = 1 / (1 - (frequency / 50.0) ** 2 + 0.2j * frequency / 50.0)
+    felt = np.fft.irfft(np.fft.rfft(motion, axis=0) * resonance, n, axis=0)
+    z = z_of(motion, felt, 0.003, seed)
+    assert abs(z).max() < 6
+    assert 0.5 < z.std() < 1.5
+
+
+def test_noise_that_a_loud_moment_lets_pass_says_nothing_of_a_delay() -> None:
+    """Where it is quiet, most that is predicted is noise: its curvature is not that of J."""
+    rng = np.random.default_rng(18)
+    n = 119 * HOP + LENGTH
+    frequency = np.maximum(np.fft.rfftfreq(n, 1 / RATE), 0.1)[:, None]
+    spectrum = np.fft.rfft(rng.standard_normal((n, 2)), axis=0) / (1 + (frequency / 4.0) ** 2)
+    motion = np.fft.irfft(spectrum, n, axis=0)
+    motion *= np.where(np.arange(n) % 8000 < 800, 30.0, 1.0)[:, None]
+    z = z_of(motion, motion.copy(), 0.05, 18)
+    assert 0.5 < z.std() < 1.5
+
+
 def test_later_batches_are_measured_in_the_frame_of_the_first() -> None:
     n = 80
     delays = np.concatenate([np.zeros(40), np.full(40, 3e-3)])  # more than half a sample
