@@ -14,6 +14,7 @@ from daq.estimation.snapshot import Snapshot, once
 from estimator.checks.advice import Rank, Untested
 from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_sensors import UnequalResponses
 from estimator.checks.advice_on_signals import NoSharedMotion
 from estimator.checks.band_steadiness import ADDED
 from estimator.checks.counts import MARGIN
@@ -32,6 +33,7 @@ from estimator.levels.interval import NORMAL_95, further_motion, interval, unpre
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.dimension import BandDimension, most_testable
 from estimator.self_noise.result import Flag, SelfNoise
+from estimator.spectra.equaliser import USABLE
 from estimator.types import BoolArray, FloatArray
 
 SECOND_ORDER = 2.5
@@ -131,6 +133,32 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
     if snapshot.sensitivities:
         found += _sensitivities(snapshot, method, shape)
     return tuple(found)
+
+
+@once
+def leaks(snapshot: Snapshot, low: float = 0.0, high: float = math.inf) -> float:
+    """Return the largest share of a channel's noise that leakage may be in a band, or beside it.
+
+    By thirds of an octave, twice what is predicted; zero where no leakage is named, infinite where
+    it may be all. Beside it, for those of a third scatter; of all thirds for the lowest and the top
+    ones, where responses are hardly known.
+    """
+    edges, frequency = snapshot.diagnostics.edge_leakage, snapshot.frequency
+    named = any(isinstance(each, UnequalResponses) for each in snapshot.diagnostics.advice)
+    if edges is None or not snapshot.results or not named:
+        return 0.0
+    noise = np.nan_to_num(np.abs(next(iter(snapshot.results.values())).noise_psd))
+    number = blocks_of(frequency)
+    near = np.ones(len(number), np.bool_)
+    inside = number[(frequency >= low) & (frequency <= high)]
+    if len(inside) and inside[0] > 0 and high <= USABLE * frequency[-1]:
+        near = (number >= inside[0] - 1) & (number <= inside[-1] + 1)
+    leakage = np.where(noise > 0, edges.most, 0.0)
+    leakage, noise = (_by_block(frequency, each)[near] for each in (leakage, noise))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.fmax(np.nan_to_num(leakage / noise), edges.share[near])
+    most = float(share.max(initial=0.0))
+    return math.inf if most > MUCH_LEAKS else most / MUCH_LEAKS
 
 
 def is_untested(snapshot: Snapshot) -> bool:

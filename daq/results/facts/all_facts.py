@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from daq.estimation.contributions import by_two
+from daq.estimation.contributions import by_two, leaks
 from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import Estimate
 from daq.results.facts.channels import facts_of_channels, facts_of_linearity, facts_of_rounding
@@ -21,7 +21,13 @@ from daq.results.facts.precision import facts_of_precision
 from daq.results.facts.recordings import facts_of_recordings
 from daq.results.facts.segments import facts_of_segments
 from estimator.checks.advice import Advice, Rank
-from estimator.checks.advice_on_noise import ResponseChanges, SharedNoise
+from estimator.checks.advice_on_model import ModelMisfit
+from estimator.checks.advice_on_noise import (
+    DisturbedSegments,
+    NoiseChanges,
+    ResponseChanges,
+    SharedNoise,
+)
 from estimator.checks.advice_on_sensors import Gain
 
 ALL, ROOM = 0.95, 1.2
@@ -89,6 +95,8 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
     for each in map(partial(_or_two_alone, snapshot), advice):
         if isinstance(each, Gain) and any(_explains(change, each) for change in changed):
             continue
+        if _is_leakage(each, leaks(snapshot, *each.band or ())):
+            continue
         kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
     ranks, names = list(Rank), snapshot.sensor_names
     for found in kinds.values():
@@ -106,6 +114,25 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
             findings=tuple(found),
             names=snapshot.names,
         )
+
+
+def _is_leakage(advice: Advice, most: float) -> bool:
+    """Whether leakage of up to `most` of the noise looks like this fault.
+
+    Leakage differs between sensors, is felt by several, and follows the motion.
+    """
+    match advice:
+        case ModelMisfit():
+            share = advice.unexplained
+        case SharedNoise():
+            share = max(abs(each) for each in advice.coherencies)
+        case NoiseChanges():  # most, if all of it is in one part
+            share = advice.deviation / math.sqrt(advice.n_parts)
+        case DisturbedSegments():
+            share = advice.excess
+        case _:
+            return False
+    return math.isinf(most) or share <= most
 
 
 def _explains(change: ResponseChanges, gain: Gain) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from daq.estimation.contributions import MUCH_NONLINEAR
+from daq.estimation.contributions import MUCH_NONLINEAR, leaks
 from daq.estimation.snapshot import Snapshot
 from daq.results.band_summary import known_range
 from daq.results.facts.fact import Fact
@@ -442,13 +442,16 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
             here = slice(int(low), int(max(high, low + 1)))
             with np.errstate(divide="ignore", invalid="ignore"):
                 most.append(median(one.most[here] / noise[here, one.column]))
+        band = (min(e.band[0] for e in of_sensor), max(e.band[1] for e in of_sensor))
+        if max(most) <= leaks(snapshot, *band):
+            continue
         yield NoiseDependsOnMotion(
             rank=Rank.TO_KNOW if max(most) <= MUCH_NONLINEAR else Rank.DELAYS,
             sensors=(sensor,),
             channels=tuple(
                 snapshot.channels[column].name for column in sorted({e.column for e in of_sensor})
             ),
-            band=(min(e.band[0] for e in of_sensor), max(e.band[1] for e in of_sensor)),
+            band=band,
             form=first.form,
             evidence=first.evidence,
             instants=first.size if first.form == "instants" else None,

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from daq.estimation.contributions import leaks
 from daq.estimation.snapshot import Snapshot
 from daq.results.facts.fact import Fact
 from estimator.checks.advice import Rank, Untested, model
@@ -14,6 +15,7 @@ from estimator.checks.advice_on_model import ModelMisfit, TooFewDimensions
 from estimator.checks.advice_on_signals import NoSharedMotion, NoSignal, TooFewSensors
 from estimator.likelihood.dimension import BandDimension
 from estimator.records import Hertz, Share
+from estimator.responses.equalisation import LARGE
 from estimator.wording import Words, few, listed, percent, span
 
 _THREE = 3  # sensors
@@ -198,6 +200,8 @@ def _shared_by_two(snapshot: Snapshot) -> Iterator[SharedByTwo]:
         here = [choice for choice in choices if pair in choice.pairs]
         instead = dict.fromkeys(other for choice in here for other in choice.alternatives)
         least = np.min([np.array(choice.least)[np.isin(sensor, pair)] for choice in here])
+        if 1 - least <= leaks(snapshot):  # what leaks into two sensors alike, no third one feels
+            continue
         yield SharedByTwo(
             rank=Rank.DELAYS,
             sensors=tuple(names[n] for n in pair),
@@ -279,8 +283,13 @@ def facts_of_model(snapshot: Snapshot) -> Iterator[Fact]:
     if not choices:
         return
     yield from _shared_by_two(snapshot)
-    biased = [(each.low, each.high) for each in choices if each.is_biased]
-    unknown = [each for each in choices if each.is_undetermined and not each.is_biased]
+    unexplained = [
+        each
+        for each in choices
+        if (each.is_biased or each.is_undetermined) and leaks(snapshot, each.low, each.high) < LARGE
+    ]
+    biased = [(each.low, each.high) for each in unexplained if each.is_biased]
+    unknown = [each for each in unexplained if not each.is_biased]
     unusual = tuple(each for each in choices if each.accepted and each.n_factors != each.usual)
     if biased:
         yield DimensionsUnexplained(rank=Rank.INVALIDATES, bands=tuple(biased))

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from daq.estimation.contributions import leaks
 from daq.results.band_summary import Estimate, averages_at, correlation_of
 from daq.results.facts.fact import Fact
 from daq.results.facts.recordings import LEAST_SHARE
@@ -152,7 +153,7 @@ def _in_gusts(estimate: Estimate) -> Iterator[NoiseInGusts]:
         wider = np.divide(*(np.diff(each)[:, 0] for each in ends)) - 1
     wider = np.nan_to_num(wider, posinf=0.0)
     some = [n for n in np.argsort(-wider).tolist() if wider[n] > MUCH_WIDER]
-    if some:
+    if some and loudness.size[some[0]] > leaks(snapshot):
         yield NoiseInGusts(
             rank=Rank.TO_KNOW,
             channels=tuple(snapshot.channels[n].name for n in some),

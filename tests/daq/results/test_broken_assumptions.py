@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daq.estimation.contributions import by_two
+from daq.estimation.contributions import by_two, leaks
 from daq.estimation.estimation import estimate
 from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.facts.fact import Finding
 from daq.results.result import Result
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_model import ModelMisfit
 from estimator.checks.advice_on_noise import SharedNoise
 
 RATE, N_SAMPLES = 100.0, 24_000
@@ -179,3 +181,41 @@ def test_what_two_sensors_alone_have_in_common_may_be_noise(shared: float) -> No
     named = [each for fact in facts for each in fact.findings if isinstance(each, SharedNoise)]
     assert bool(named) == bool(shared)
     assert all((0, 1) in each.channels + each.alternatives for each in named)
+
+
+def late(motion: list[np.ndarray], *, corner: float | None = None) -> None:
+    """Delay two sensors by 10 and 20 ms, or let these have low passes of the corner, and half."""
+    frequency = np.fft.rfftfreq(N_SAMPLES, 1 / RATE)
+    for n in (0, 1):
+        response = np.exp(-2j * np.pi * frequency * 0.01 * (n + 1))
+        if corner is not None:
+            response /= 1 + 1j * (n + 1) * frequency / corner
+        spectra = np.fft.rfft(motion[n], axis=0) * response[:, None]
+        motion[n] = np.fft.irfft(spectra, N_SAMPLES, axis=0)
+
+
+def facts_that_delay(snapshot: Snapshot) -> set[str]:
+    facts = [fact for fact in Result(snapshot, SETTINGS).facts if fact.rank is not Rank.TO_KNOW]
+    return {
+        type(fact.findings[0] if isinstance(fact, Finding) else fact).__name__ for fact in facts
+    }
+
+
+def test_leakage_of_unlike_responses_is_no_motion_that_sensors_do_not_share() -> None:
+    rng = np.random.default_rng(1)
+    noise, motion = white(rng, 3), felt(rng, 3, 3e3)
+    late(motion, corner=10.0)
+    snapshot = estimated(motion, noise)
+    assert any(isinstance(each, ModelMisfit) for each in snapshot.diagnostics.advice)
+    assert facts_that_delay(snapshot) == {"UnequalResponses"}
+    assert held(snapshot, noise).mean() >= 0.95
+
+
+def test_noise_that_two_sensors_share_is_named_beside_less_leakage() -> None:
+    rng = np.random.default_rng(1)
+    noise, motion = white(rng, 5), felt(rng, 5, 300.0)
+    noise[:2, :, 0] += rng.standard_normal(N_SAMPLES)
+    late(motion)
+    snapshot = estimated(motion, noise)
+    assert 0.1 < leaks(snapshot) < 0.5
+    assert facts_that_delay(snapshot) == {"UnequalResponses", "SharedByTwo"}
