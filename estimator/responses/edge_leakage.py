@@ -222,9 +222,11 @@ class ChannelResponses:
         variance = np.full(slopes.shape, np.inf)
         width = (f[2:] - f[:-2])[:, None, None]
         with np.errstate(divide="ignore"):
-            own = (1 / self.coherence[1:-1] - 1) / max(n_effective, 1.0)
-        own[self.coherence[1:-1] < MIN_COHERENCE] = np.inf
-        variance[1:-1] = _TWO_FREQUENCIES * own / width**2
+            own = (1 / self.coherence - 1) / max(n_effective, 1.0)
+        own[self.coherence < MIN_COHERENCE] = np.inf
+        variance[1:-1] = _TWO_FREQUENCIES * (own[2:] + own[:-2]) / 2 / width**2
+        first = np.isnan(self.ratio[:-3])  # its slope is that of the next
+        variance[1:-2] = np.where(first, variance[2:-1], variance[1:-2])
         known = np.isfinite(slopes) & np.isfinite(variance)
         slopes, variance = np.where(known, slopes, 0.0), np.where(known, variance, 0.0)
         n_known = known.sum(axis=2)

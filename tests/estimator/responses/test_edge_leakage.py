@@ -21,6 +21,7 @@ from estimator.responses.equalisation import (
     significant_minimum,
 )
 from estimator.spectra.windows import get_window
+from tests.estimator.csm_models import wishart
 
 DIMS = (3, 3, 3)
 T = 10.0
@@ -138,6 +139,23 @@ def test_equal_sensors_leak_nothing_whatever_the_signs_of_their_predictions(n_se
     found = channel_responses(csm, f, dims=dims).leakage(motion, FACTOR, n_effective=n)
     share, deviation = band_shares(*found, np.ones_like(motion), f)
     assert significant_minimum(share, deviation, f).max() < leakage_threshold(n)
+
+
+def test_equal_sensors_leak_nothing_where_motion_ends() -> None:
+    """A slope is as uncertain as the frequencies on both sides, of which one lacks the motion."""
+    frequency = np.arange(501) / T
+    edge = np.cos(np.pi / 2 * np.clip((frequency - 40) / 5, 0, 1)) ** 2
+    for seed in range(20):
+        directions = np.vstack(turned(seed))
+        csm = 1e5 * edge[:, None, None] * directions @ directions.T + np.eye(9)
+        averages = wishart(csm.astype(np.complex128), 45, np.random.default_rng(seed))[0]
+        found = channel_responses(averages, frequency, dims=DIMS)
+        motion = np.einsum("fpp->fp", averages).real - 1
+        left, deviation = found.leakage(motion, FACTOR, n_effective=45)
+        share = significant_minimum(
+            *band_shares(left, deviation, np.ones((501, 9)), frequency), frequency
+        )
+        assert (share <= leakage_threshold(45)).all()
 
 
 def test_the_sensor_that_differs_is_the_one_filtered() -> None:
