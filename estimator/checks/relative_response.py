@@ -133,7 +133,8 @@ class RelativeResponse:
         right angles, and unequal gains of `first`, which look like them, make the rotation unclear
         by as much.
     gains, gain_errors : float64, shape (d,)
-        Gains of the channels of `second` over those of `first`, and their standard errors.
+        Gains of the channels of `second` over those of `first`, and their standard errors. These
+        are infinite where the phase turns over the band, so that sums over it cancel.
     nonorthogonality_deg : float
         Largest deviation from a right angle between channels of `second`, if those of `first`
         are orthogonal and have equal gains.
@@ -387,6 +388,11 @@ def _response(
     rotation_deg, horizontal_deg = _angles(matrix[None], horizontal)[0].tolist()
     gains_without, between_without = _gains_and_skew(without)
     gain_errors = _jackknife(gains_without, gains)
+    cancels = [
+        _cancels(at, channels, rest, np.linalg.norm(found.sum(axis=0), axis=1))
+        for channels, found in zip(own, (right, left), strict=True)
+    ]
+    gain_errors[cancels[0].any() | cancels[1]] = np.inf
     skew_errors = _jackknife(between_without, between)
     turned = _jackknife(np.rad2deg(_rotations(without)[0] - rotation), rotation)
     skew, skew_error = float(np.abs(between).max()), float(np.linalg.norm(skew_errors))
@@ -433,6 +439,15 @@ def _of_late_others(
     turn = np.exp(2j * np.pi * f[:, None] * np.array(late))
     better = np.linalg.norm((spectra * turn[:, None]).sum(axis=0))
     return turn if better > 2 * found else None
+
+
+def _cancels(at: _At, channels: IntArray, rest: IntArray, found: FloatArray) -> BoolArray:
+    """Return of which channels spectra with the others cancel in their sum, of this norm."""
+    some = slice(None, None, max(1, len(at.frequency) // _SOME))
+    by = at.weight / at.power
+    each = np.abs(_part(at.csm, at.inside[some], channels, rest)) * by[some, None, None]
+    whole = np.linalg.norm(each.sum(axis=0), axis=1) * by.sum() / by[some].sum()
+    return np.asarray(found < _CANCELLED * whole)
 
 
 def _with_others(

@@ -67,7 +67,9 @@ def orientation(
     pair = (response.first, response.second)
     band = (response.low, response.high)
     counterpart, own = (sum(dims[:sensor]) for sensor in pair)
-    swapped = {} if response.is_ambiguous else _swapped(response)
+    unknown = CERTAIN * response.gain_errors > response.gains  # what is summed cancels
+    has_sign = not response.is_ambiguous and not unknown.any()
+    swapped = _swapped(response) if has_sign else {}
     if swapped:
         yield advice_on_sensors.SwappedChannels(
             rank=Rank.DELAYS,
@@ -76,7 +78,6 @@ def orientation(
             channels=tuple((own + c, counterpart + other) for c, other in swapped.items()),
         )
         return
-    has_sign = not response.is_ambiguous
     if has_sign and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
         yield advice_on_sensors.Rotated(
             rank=Rank.TO_KNOW,
@@ -103,8 +104,8 @@ def orientation(
             channel=own + channel,
             counterpart=counterpart + channel,
         )
-    off = int(np.argmax(np.abs(response.gains - 1)))
-    if _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
+    off = int(np.argmax(np.where(unknown, 0.0, np.abs(response.gains - 1))))
+    if not unknown[off] and _exceeds(abs(response.gains[off] - 1), GAIN, response.gain_errors[off]):
         harmless = TOLERANCE if dims[response.first] == 3 else LARGE_ERROR  # axes may be askew
         very = abs(np.log(response.gains[off])) > np.log1p(harmless)
         yield advice_on_sensors.Gain(

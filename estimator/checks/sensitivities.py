@@ -176,7 +176,7 @@ def _both_ways(response: RelativeResponse) -> list[tuple[tuple[int, int], _Gains
     """
     first, second = response.first, response.second
     errors = response.gain_errors / response.gains
-    errors = np.where(np.isfinite(errors), errors, UNKNOWN_ERROR)
+    errors = np.where(np.isnan(errors), UNKNOWN_ERROR, errors)
     found = [((first, second), _Gains(response.gains, response.gains * errors))]
     if np.linalg.cond(response.matrix) < 1e6:
         back = np.linalg.norm(np.linalg.inv(response.matrix), axis=1)

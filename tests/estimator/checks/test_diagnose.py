@@ -186,6 +186,17 @@ def test_reversed_polarity_is_found_with_its_channel() -> None:
     assert first.rank is Rank.DELAYS
 
 
+def test_a_channel_whose_phase_turns_over_the_band_is_neither_weak_nor_reversed() -> None:
+    """What it has in common with others cancels in sums over the band: gains were .01 or 20."""
+    late = np.ones((len(FREQUENCY), 9), np.complex128)
+    late[:, 4] = np.exp(-2j * np.pi * FREQUENCY * 0.1)
+    csm = bench(*3 * [np.eye(3)]) * late[:, :, None] * late[:, None].conj()
+    for seed in range(4):
+        found = of(averages(csm, seed=seed))
+        assert not advice_of(Gain, found)
+        assert not advice_of(ReversedPolarity, found)
+
+
 @pytest.mark.parametrize(
     ("angle_deg", "level"), [(5.7, Rank.TO_KNOW), (25.0, Rank.DELAYS)], ids=["some", "much"]
 )
