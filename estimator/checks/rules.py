@@ -26,7 +26,7 @@ from estimator.checks.advice_on_noise import NoiseChanges, ResponseChanges, Shar
 from estimator.checks.band import BandDiagnosis
 from estimator.checks.relative_response import RelativeResponse
 from estimator.checks.sensitivities import TOLERANCE
-from estimator.checks.shared_motion import outsiders, shown_from
+from estimator.checks.shared_motion import MIN_OF_ONE, outsiders, shown_from
 from estimator.checks.shared_noise import SharedPairs
 from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.coherency import Coherency, presence
@@ -142,6 +142,8 @@ SMALL_ERROR = 0.05
 WEAKER = 6.0
 """SNR over that from which a dimension is significant, below which none is said to miss: it may be
 as strong as the others."""
+HIDDEN = 4.0
+"""SNR below which a noisy sensor, or one with a low pass, may seem to record no motion."""
 _NEARLY_SINGULAR = 30.0  # condition number; the scatter of smaller ones is no surprise
 
 
@@ -187,7 +189,7 @@ def advise(
     alive = presence(given, dims).dims
     strangers = [
         replace(each, for_part=not moved.isdisjoint(each.sensors))
-        for each in _strangers(bands, len(dims), n_effective)
+        for each in _strangers(bands, dims, n_effective)
     ]
     others = [
         *(
@@ -259,15 +261,22 @@ def _within(band: tuple[float, float], low: float, high: float) -> bool:
 
 
 def _strangers(
-    bands: tuple[BandDiagnosis, ...], n_sensors: int, n_effective: float
+    bands: tuple[BandDiagnosis, ...], dims: tuple[int, ...], n_effective: float
 ) -> Iterator[advice_on_signals.NoSharedMotion]:
     """Yield advice on sensors that record none of the motion shared by others.
 
-    Other findings in these bands are consequences, and not reported.
+    Other findings in these bands are consequences, and not reported. Weak motion may be hidden by
+    the noise of a sensor that shares it elsewhere.
     """
     of_bands = [dict(outsiders(band.shared, n_effective, band.n_frequencies)) for band in bands]
-    for sensor in range(n_sensors):
-        named = [sensor in found for found in of_bands]
+    starts = np.cumsum([0, *dims[:-1]])
+    strong = [np.fmax.reduceat(band.snr, starts) for band in bands]
+    for sensor in range(len(dims)):
+        shares = any(np.any(band.shared[sensor] >= MIN_OF_ONE) for band in bands)
+        named = [
+            sensor in found and not (shares and np.min(snr[list(found[sensor])]) < HIDDEN)
+            for found, snr in zip(of_bands, strong, strict=True)
+        ]
         for is_stranger, run in groupby(range(len(bands)), named.__getitem__):
             here = list(run)
             if is_stranger:
@@ -467,7 +476,7 @@ def _dimensions(
     shown = max(1.0, WEAKER * shown_from(dims, n_effective))
 
     def is_missing(band: BandDiagnosis) -> bool:
-        return band.dimension <= full - 1 and bool(np.any(band.snr >= shown))
+        return 0 < band.dimension <= full - 1 and bool(np.any(band.snr >= shown))
 
     for run in _runs(bands, is_missing):
         yield advice_on_model.MissingDimension(
