@@ -187,9 +187,10 @@ class Schemas:
         for key, name in getattr(kind, "IN_JSON", {}).items():
             found = getattr(kind, name)
             hints = get_type_hints(found.fget, _names(kind.__module__), include_extras=True)
-            made = self.of(hints["return"])
-            text = _NULL.sub("null", plain_text(inspect.getdoc(found) or ""))
-            yield key, made | {"description": text}, True
+            axes, text = about.get(name, ((), plain_text(inspect.getdoc(found) or "")))
+            text += f" Array of {' × '.join(axes)}." if axes else ""
+            made = self.of(hints["return"], len(axes))
+            yield key, made | {"description": _NULL.sub("null", text)}, True
 
     def document(self, kind: Any) -> Schema:  # noqa: ANN401 - any type
         """Return the schema of a document; of several, that of all their keys."""

@@ -427,7 +427,6 @@ def diagnosis(
             snr=_over(bands, [each.snr for each in found]),
             statistic=_over(bands, [each.model.statistic for each in found]),
             degrees=_over(bands, [each.model.degrees for each in found]),
-            p_value=_over(bands, [each.model.p_value for each in found]),
         ),
     )
     tested = any(np.isfinite(band.test.p_value) for band in whole.bands)

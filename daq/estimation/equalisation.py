@@ -149,7 +149,11 @@ class Equalisation:
         )
         snr = np.full((len(grid), 1), _ASSUMED_SNR)
         best: tuple[float, ComplexArray] | None = None
-        for target in np.unique(np.round(response, 12), axis=1).T:
+        columns = {
+            each.tobytes(): each for each in np.round(np.ascontiguousarray(response.T), 12) + 0
+        }
+        # in order of their values; `np.unique` makes a type with a field for each frequency
+        for target in sorted(columns.values(), key=lambda each: each.view(np.float64).tolist()):
             like = int(np.argmin(np.abs(response - target[:, None]).sum(axis=0)))
             wanted = np.ones_like(response)
             cost = 0.0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from estimator.checks.advice import Untested
 from estimator.checks.count_limits import CountLimits
 from estimator.checks.loudness import Loudness
+from estimator.likelihood.goodness_of_fit import ModelTest
 from estimator.records import dataclass
 
 if TYPE_CHECKING:
@@ -142,7 +143,12 @@ class FrequencyDiagnosis:
     snr: FloatArray
     statistic: FloatArray
     degrees: FloatArray
-    p_value: FloatArray
+    IN_JSON: ClassVar[Mapping[str, str]] = {"p_value": "p_value"}
+
+    @property
+    def p_value(self) -> FloatArray:
+        """Of the model test, shape (n_freqs,)."""
+        return ModelTest(self.statistic, self.degrees).p_value
 
 
 @dataclass(frozen=True, slots=True, eq=False)

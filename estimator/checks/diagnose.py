@@ -51,7 +51,6 @@ from estimator.likelihood.goodness_of_fit import (
     critical_value,
     deflated,
     model_test,
-    p_values,
     pool,
     rejected_below,
 )
@@ -628,17 +627,17 @@ def _test(
     """
     unknown = np.full(n_freqs, np.nan)
     if isinstance(fit, Untested):
-        return ModelTest(unknown, unknown, unknown), fit
+        return ModelTest(unknown, unknown), fit
     try:
         test = model_test(fit, n_effective=n_effective)
     except InsufficientDataError:  # as many parameters as the matrix has
-        return ModelTest(unknown, unknown, unknown), Untested.TOO_FEW_CHANNELS
-    untested = None if np.isfinite(test.p_value).any() else Untested.SINGULAR
+        return ModelTest(unknown, unknown), Untested.TOO_FEW_CHANNELS
+    untested = None if np.isfinite(test.statistic).any() else Untested.SINGULAR
     if len(set(there.dims)) == 1 and fit.n_factors <= there.dims[0]:
         return test, untested
     information = fisher.information(fit)
     degrees = test.degrees + (n_effective * np.linalg.eigvalsh(information) < 1).sum(axis=1)
-    return ModelTest(test.statistic, degrees, p_values(degrees, test.statistic)), untested
+    return ModelTest(test.statistic, degrees), untested
 
 
 def _compared(there: PresentSensors, found: list[RelativeResponse]) -> Iterator[tuple[int, int]]:

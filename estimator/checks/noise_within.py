@@ -7,7 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimator.likelihood.factor_analysis import Maximum, maximise, n_noise
-from estimator.likelihood.goodness_of_fit import ModelTest, model_test, pool, rejected_below
+from estimator.likelihood.goodness_of_fit import (
+    ModelTest,
+    model_test,
+    pool,
+    rejected_below,
+)
 from estimator.median import median
 from estimator.self_noise.coherency import Coherency, testable
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -62,7 +67,7 @@ def beside_matrices(
     ]
     ones = [each for each in ones if (sum(dims) - n_factors) ** 2 > n_noise(each)]
     widened = np.zeros(len(insides), np.bool_)
-    found = [each.copy() for each in (model.statistic, model.degrees, model.p_value)]
+    found = [each.copy() for each in (model.statistic, model.degrees)]
     failed = [n for n, test in enumerate(tests if ones else ()) if test.p_value < rejected]
     lines = np.full(len(frequency), -1)
     if not failed:
@@ -78,7 +83,7 @@ def beside_matrices(
     for number, rows, look, some in zip(
         failed, every, seen, map(slice, edges, edges[1:]), strict=False
     ):
-        out = rows[model.p_value[rows] < STANDS_OUT]
+        out = rows[ModelTest(model.statistic[rows], model.degrees[rows]).p_value < STANDS_OUT]
         if 0 < len(out) <= max(LINE, LINES * len(rows)) and len(out) < len(rows):
             others = insides[number].copy()
             others[out] = False
@@ -113,7 +118,7 @@ def _excess(psd: FloatArray, out: IntArray, others: BoolArray, dims: tuple[int, 
 
 
 def _put(found: list[FloatArray], test: ModelTest, rows: IntArray) -> None:
-    for each, values in zip(found, (test.statistic, test.degrees, test.p_value), strict=True):
+    for each, values in zip(found, (test.statistic, test.degrees), strict=True):
         each[rows] = values
 
 

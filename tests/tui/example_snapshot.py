@@ -161,7 +161,6 @@ def diagnosed(
             snr=found.snr,
             statistic=found.model.statistic,
             degrees=found.model.degrees,
-            p_value=found.model.p_value,
         ),
     )
     return replace(

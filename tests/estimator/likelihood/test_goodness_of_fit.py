@@ -90,7 +90,7 @@ def test_pooled_false_alarms_under_a_taper(overlap: float) -> None:
     runs = np.array(statistic)
     p_values = []
     for run in runs:
-        test = ModelTest(run, np.full(len(run), 10.0), scipy.stats.chi2.sf(run, 10))
+        test = ModelTest(run, np.full(len(run), 10.0))
         for first in range(0, len(run) - 20, 20):
             band = np.zeros(len(run), np.bool_)
             band[first : first + 20] = True
@@ -142,7 +142,7 @@ def test_a_gross_violation_is_detected_at_one_frequency() -> None:
 
 
 def test_an_unusable_frequency_is_not_pooled() -> None:
-    test = ModelTest(np.array([10.0, np.nan, 12.0]), np.full(3, 10.0), np.array([0.5, np.nan, 0.4]))
+    test = ModelTest(np.array([10.0, np.nan, 12.0]), np.full(3, 10.0))
     band = pool(test, np.ones(3, np.bool_))
     assert band.n_frequencies == 2
     assert band.statistic == 22
@@ -152,7 +152,7 @@ def test_an_unusable_frequency_is_not_pooled() -> None:
 
 def test_pooling_allows_for_correlated_neighbours() -> None:
     """Amplitudes correlated by 0.5 and statistics by its square: the sum of 10 is that of fewer."""
-    test = ModelTest(np.full(10, 13.0), np.full(10, 10.0), np.full(10, 0.2))
+    test = ModelTest(np.full(10, 13.0), np.full(10, 10.0))
     spread = 1 + 2 * 9 * 0.5**2 / 10
     band = pool(test, np.ones(10, np.bool_), neighbours=np.array([0.5]))
     assert band.p_value == pytest.approx(scipy.stats.chi2.sf(130 / spread, 100 / spread))
