@@ -159,10 +159,11 @@ def _signs(d: int) -> FloatArray:
 
 def _apart(bins: IntArray, groups: list[IntArray]) -> Iterator[IntArray]:
     """Yield the places in each group of frequencies that are no neighbours of earlier groups."""
-    before = bins[:0]
+    before = np.zeros(bins.max(initial=0) + 3, np.bool_)  # a place later, so that 0 has neighbours
     for group in groups:
-        near = np.isin(bins[group] - 1, before) | np.isin(bins[group] + 1, before)
-        before = np.concatenate([before, bins[group]])
+        own = bins[group]
+        near = before[own] | before[own + 2]
+        before[own + 1] = True
         yield np.flatnonzero(~near)
 
 

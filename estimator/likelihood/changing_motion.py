@@ -45,6 +45,7 @@ import numpy as np
 from estimator.errors import InsufficientDataError
 from estimator.levels.interval import NORMAL_95
 from estimator.likelihood.goodness_of_fit import digamma, trigamma, upper_tail
+from estimator.median import median
 from estimator.records import dataclass
 from estimator.self_noise.result import Refusal
 from estimator.types import BoolArray, ComplexArray, FloatArray, IntArray
@@ -380,7 +381,7 @@ def _trusted(point: _Point) -> tuple[FloatArray, FloatArray]:
     scale = np.sqrt(np.maximum(np.einsum("fbb->fb", each).mean(axis=0), 1e-300))
     unit = each / scale[:, None] / scale
     w = np.linalg.eigvalsh(unit)
-    rank = int(np.median((w > _ZERO * w[:, -1:]).sum(axis=1)))
+    rank = int(median((w > _ZERO * w[:, -1:]).sum(axis=1)))
     w, u = np.linalg.eigh(unit.sum(axis=0))
     u, w = u[:, len(w) - rank :], w[len(w) - rank :]
     inside = (u * w) @ u.T * scale[:, None] * scale
@@ -587,7 +588,7 @@ def _estimate(
     variance = _left(*raw) + usual - _left(p, cross, r)
     determined = _determined(point.mixed_part(certain) + contrasts, diagonal)
     beyond = _quantile(freedom) - 1
-    clear = np.median(np.linalg.eigvalsh(r - beyond * scatter)[:, 0]) > q * _CLEAR
+    clear = median(np.linalg.eigvalsh(r - beyond * scatter)[:, 0]) > q * _CLEAR
     free = np.sqrt(parts.alike) * _sandwich(
         *(point.mixed_part(usual) + contrasts, point.mixed_part(variance) + contrasts),
         list(range(len(model.basis))),

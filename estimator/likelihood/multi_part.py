@@ -20,6 +20,7 @@ import numpy as np
 from estimator.levels.interval import CERTAIN, NORMAL_95, interval, unpredicted, worth
 from estimator.levels.pooled import blocks_of
 from estimator.likelihood.changing_motion import MOST, STEADINESS, ChangingMotionNoise, band_noise
+from estimator.median import median
 from estimator.records import dataclass
 from estimator.self_noise.result import Flag, Refusal, SelfNoise, joined
 from estimator.spectra.parts import Parts, grouped, joined_parts
@@ -219,7 +220,7 @@ def multi_part(
     block = blocks_of(frequency) if block is None else block
     lags = np.ones(1) if correlation is None else correlation
     found = []
-    for number in np.unique(block[known]):
+    for number in sorted({*block[known].tolist()}):
         bins = np.flatnonzero(known & (block == number))
         edges = float(frequency[bins[0]]), float(frequency[bins[-1]])
         if len(averages) < FEWEST:
@@ -421,7 +422,7 @@ def _worth_judging(
     known = np.isfinite(course).all(axis=0) & np.isfinite(motion[parts.bins])
     block = blocks_of(frequency)
     narrow, wide = [], []
-    for number in np.unique(block[parts.bins[known]]):
+    for number in sorted({*block[parts.bins[known]].tolist()}):
         kept = np.flatnonzero(known & (block[parts.bins] == number))
         level = course[:, kept].mean(axis=1)
         scatter = 1 / (parts.averages.mean() * len(kept))
@@ -429,7 +430,7 @@ def _worth_judging(
             continue
         n_known = np.count_nonzero((block == number) & np.isfinite(motion))
         is_whole = len(kept) == n_known <= NARROW
-        if is_whole and np.median(motion[parts.bins[kept]]) < WEAK:
+        if is_whole and median(motion[parts.bins[kept]]) < WEAK:
             narrow.append(kept)
         else:
             wide.append(kept)

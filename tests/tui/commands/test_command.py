@@ -233,7 +233,7 @@ def test_an_estimate_loads_no_more_than_it_needs(scenario: str, tmp_path: Path) 
     """``np.median``, ``np.quantile`` and most uses of ``np.unique`` load ``numpy.ma``."""
     path = tmp_path / "short.h5"
     named = str(ROOT / scenario) if scenario.endswith(".toml") else scenario
-    printed("simulate", named, "--duration", "40s", "--out", str(path))
+    printed("simulate", named, "--duration", "4min", "--out", str(path))
     run = f"main(['estimate', {str(path)!r}])"
     loaded = modules_after(
         f"from tui.commands.main import main\ntry:\n    {run}\nexcept SystemExit:\n    print()"
