@@ -28,7 +28,7 @@ from estimator.errors import EstimatorError
 from estimator.median import median
 from estimator.records import dataclass
 from estimator.spectra.parts import PartEnds
-from estimator.spectra.welch import CrossSpectra, SegmentSpectra, WelchSettings
+from estimator.spectra.welch import TAPERED_VALUES, CrossSpectra, SegmentSpectra, WelchSettings
 from estimator.spectra.windows import get_window
 from estimator.types import FloatArray, IntArray
 
@@ -36,7 +36,6 @@ FIRST_BAND = 8  # frequencies in the lowest band; every other band is an octave
 FLATLINE_SAMPLES = 32  # consecutive equal samples of a dead channel
 LONGER = 2.0  # ratio to the usual time for channels that are often constant, at threshold 6
 MIN_FOR_MEDIAN = 5  # minimum number of segments for a median
-SEGMENTS_PER_BLOCK = 32
 REPORTED = 20_000  # maximum number of excluded segments kept individually
 
 
@@ -185,8 +184,9 @@ class SelectedSpectra:
             places = self.n_segments + np.arange(len(starts))
         self.n_segments += len(starts)
         passed: list[tuple[int, int]] = []
-        for first in range(0, len(starts), SEGMENTS_PER_BLOCK):
-            some = slice(first, first + SEGMENTS_PER_BLOCK)
+        block = max(1, TAPERED_VALUES // (self.settings.segment_length * samples.shape[1]))
+        for first in range(0, len(starts), block):
+            some = slice(first, first + block)
             tested = zip(starts[some].tolist(), places[some].tolist(), strict=True)
             levels_of = self._levels(samples, starts[some])
             for (row, number), levels in zip(tested, levels_of, strict=True):
