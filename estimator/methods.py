@@ -121,6 +121,8 @@ def self_noise(
     if found is None and given is not None and method == "maximum-likelihood":
         options["matrices"] = False  # the engine has them
         last = _only_where_asked(given, dims, n_dims)
+    if given is not None and method == "three-sensor":
+        options["given"] = given
     if last:
         unknown = np.full((4, *csm.shape[:2]), np.nan)
         found = SelfNoise.of(method, unknown[0], unknown[1:], np.zeros(csm.shape[:2], np.int64))

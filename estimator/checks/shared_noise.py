@@ -230,9 +230,15 @@ def _without_delay(
         pair, phase, turn, limit = late
         by = np.exp(1j * (phase + turn * np.arange(len(maximum.psi))))
         channels = np.flatnonzero(sensor == other[pair])
-        there = np.any([bands[n] for n in some], axis=0)
         after = reduce(
-            add, of(maximum.take(there).turned(channels, by[there]), some, there).values()
+            add,
+            (
+                each  # of one band at a time: a fit takes as much as all averages
+                for n in some
+                for each in of(
+                    maximum.take(bands[n]).turned(channels, by[bands[n]]), [n], bands[n]
+                ).values()
+            ),
         )
         if after.z[pair] ** 2 - before.z[pair] ** 2 > limit:
             turned = maximum.turned(channels, by)

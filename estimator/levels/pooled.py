@@ -336,6 +336,7 @@ def _pool(
             fit = _fitted(
                 mean, parts, q[more], sensor, unit=unit[more], n_effective=n_effective, most=most
             )
+            del mean  # it is as large as what the fit has
             # a strong dimension whose response varies looks like a further one in a larger
             # sub-block; what leaks of it makes the noise of some channels larger
             noise = (np.abs(np.linalg.inv(whitener[more])) ** 2).sum(axis=2)
@@ -349,8 +350,7 @@ def _pool(
             found.shared[parts.bins[parts.start[own]]] = False
             here = more[better]
             level[here], whitener[here] = fit.level[better], fit.whitener[better]
-            best[here] = fit.resolved[better]
-            as_whole[here] = False
+            best[here], as_whole[here] = fit.resolved[better], False
         k[at] *= 2
         at = at[(best[at] < q[at]) & (k[at] <= largest[at])]
     _read(found, matrix, whole, sensor, as_whole)

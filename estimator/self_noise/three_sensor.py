@@ -226,6 +226,7 @@ def three_sensor(
     n_effective: float,
     correct: bool = True,
     scatter: bool = True,
+    given: Coherency | None = None,
 ) -> SelfNoise:
     """Return the self-noise PSD of every channel of three or more sensors of any orientation.
 
@@ -245,6 +246,8 @@ def three_sensor(
         Divide by ``1 - d / n_effective``, which removes the small-sample bias.
     scatter : bool
         Find c.o.v. and intervals, which takes most of the time with many sensors; NaN without.
+    given : Coherency, optional
+        `csm`, if it is checked and normalised already.
 
     Returns
     -------
@@ -268,7 +271,7 @@ def three_sensor(
        orientations".
     """
     check_dims(dims)
-    given = coherency(csm, dims)
+    given = coherency(csm, dims) if given is None else given
     return estimate(
         given, dims=dims, n_effective=n_effective, correct=correct, weighted=True, scatter=scatter
     )
