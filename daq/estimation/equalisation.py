@@ -71,6 +71,7 @@ _KNOWN = 0.9  # share of frequencies at which the others predict every channel
 _JUMPS = 1.0  # leakage that noise feigns, over the noise, from which windows jump at their ends
 _FROM_AFAR = 2.0  # of what leaks through jumps, that more may leak: lines hide their own responses
 _FINE = 4  # points of known responses for each of a spectrum
+_SURELY = 2.0  # standard deviations, by which noise is higher at the lowest frequencies
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -429,7 +430,8 @@ class Equalisation:
 def _of_trends(band: Band, result: SelfNoise) -> FloatArray:
     """Return what trends of the noise within segments leak, shape (n_freqs, n_channels).
 
-    As much as if what the lowest two known frequencies have beyond others near them were of trends.
+    As much as if what the lowest two known frequencies surely have beyond others near them were of
+    trends.
     """
     noise, welch = np.nan_to_num(result.noise_psd), band.settings
     known = np.flatnonzero(np.isfinite(result.noise_psd).any(axis=1) & (band.frequencies > 0))
@@ -445,7 +447,9 @@ def _of_trends(band: Band, result: SelfNoise) -> FloatArray:
     trend *= get_window(welch.window, length)
     leaks = np.abs(np.fft.rfft(trend)[lines]) ** 2
     low, rest = (noise[some].mean(axis=0) for some in (known[:2], near))
-    return np.asarray(leaks[:, None] / leaks[known[:2]].mean() * np.maximum(low - rest, 0.0))
+    scatter = np.sqrt(np.nan_to_num(result.cumulants[0, known[:2]]).max(axis=0))
+    more = np.maximum(low - rest - _SURELY * scatter, 0.0)
+    return np.asarray(leaks[:, None] / leaks[known[:2]].mean() * more)
 
 
 def _by_all_others(band: Band, dims: tuple[int, ...]) -> SelfNoise | None:
