@@ -194,9 +194,9 @@ def test_commands_are_functions_with_their_numbers(tmp_path: Path) -> None:
     huddle.simulate("fig9", duration="15s").write(path)
     result = huddle.estimate(path, segment="1s")
     told = json.loads(command("calibrate", str(path), "--segment", "1s", "--json", "-"))
-    found = huddle.calibrate(result)
+    found = huddle.calibrate(path, segment="1s")
     assert found.reference == 0
-    again = huddle.calibrate(path, segment="1s", confidence=0.99)
+    again = huddle.calibrate(result, confidence=0.99)
     assert again.confidence == 0.99
     assert json.loads(json_text(calibration_document(found, result.snapshot))) == told
     for suffix in (".csv", ".npz", ".nc"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from daq.estimation.noise_estimates import Channels, responses
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.snapshot import DependentChannel, NonlinearChannel
-from estimator.checks.linearity import MOST_SEGMENTS, SquaresAndCubes
+from estimator.checks.linearity import MOST_BINS, MOST_SEGMENTS, MOST_VALUES, SquaresAndCubes
 from estimator.levels.interval import unpredicted
 from estimator.self_noise.result import Flag, SelfNoise
 from estimator.spectra.multiresolution import Band
@@ -18,6 +19,8 @@ from estimator.types import FloatArray, IntArray
 _OF_SQUARES = 0.02
 """Power that squares and cubes explain, over the most that depends on the motion, from which these
 are what bends: their own contribution has it."""
+_MOST_OF_ALL, _TOGETHER = 2000, 96
+"""Segments that say what may bend channels that are calibrated, and how many are held at once."""
 _SHOWN = 2.0
 """Power of a channel over what other sensors leave of it, below which none can be loud enough."""
 
@@ -28,6 +31,8 @@ def nonlinear_channels(
     frequency: FloatArray,
     channels: Channels,
     unit: str,
+    *,
+    calibrates: bool,
 ) -> tuple[tuple[NonlinearChannel, ...], tuple[DependentChannel, ...], FloatArray | None]:
     """Return the channels that are not linear, and those whose noise depends on their motion.
 
@@ -42,6 +47,8 @@ def nonlinear_channels(
         Of the estimate, in Hz.
     channels : sequence of (str, Channel)
     unit : str
+    calibrates : bool
+        Whether all segments say what may bend channels, and not a few.
     """
     welch = passes[0].welch
     tested = SquaresAndCubes(welch, min(each.aligned.usable for each in passes))
@@ -87,7 +94,26 @@ def nonlinear_channels(
         or each.column not in by_squares
         or by_squares[each.column].sum() < _OF_SQUARES * each.most.sum()
     ]
-    return tuple(nonlinear), tuple(dependent), tested.bends(sensor)
+    bends = _bends(passes, sensor) if calibrates else tested.bends(sensor)
+    return tuple(nonlinear), tuple(dependent), bends
+
+
+def _bends(passes: Sequence[Pass], sensor: IntArray) -> FloatArray:
+    """Return what `SquaresAndCubes.bends` does, of all segments, up to `_MOST_OF_ALL`."""
+    welch, total = passes[0].welch, sum(each.n_seen for each in passes)
+    more = max(MOST_BINS, MOST_VALUES // (_TOGETHER * len(sensor)))
+    usable = min(each.aligned.usable for each in passes)
+    tested = SquaresAndCubes(welch, usable, more=more, most_values=0)
+    hop = max(welch.hop, welch.segment_length // 2)  # more of an overlap tells little more
+    for each in passes:
+        last = max(each.n_seen - 1, 0) * welch.hop
+        wanted = min(last // hop + 1, round(_MOST_OF_ALL * each.n_seen / max(total, 1)))
+        starts = np.linspace(0, last, wanted).astype(np.int64)
+        for some in np.array_split(starts, math.ceil(wanted / _TOGETHER) or 1):
+            for samples, _ in each.whole_segments(some):
+                tested.add(samples)
+            tested.gather(sensor)
+    return tested.bends(sensor)
 
 
 def _add_segments(tested: SquaresAndCubes, passes: Sequence[Pass], sensor: IntArray) -> None:

@@ -52,11 +52,15 @@ class Settings(EstimateSettings):
         Only what lies between is estimated; with time zone.
     sampling_rate : float or None
         Of the common grid in Hz; the lowest of the sensors', if not given.
+    calibrates : bool
+        Whether gains are wanted: all segments then tell what may bend channels, which takes about
+        as long as the rest.
     """
 
     start: datetime | None = None
     end: datetime | None = None
     sampling_rate: float | None = None
+    calibrates: bool = False
 
     def at(self, created: datetime) -> Settings:
         """Return settings that exclude instants, of a recording that began at `created`."""

@@ -293,7 +293,14 @@ class SnapshotBuilder:
         latest, events = last.recording, last.recording.events
         left = _not_estimated(latest, channels)
         nonlinear, dependent, bends = (
-            nonlinear_channels(passes, raw, frequency, channels, self._unit)
+            nonlinear_channels(
+                passes,
+                raw,
+                frequency,
+                channels,
+                self._unit,
+                calibrates=self._settings.calibrates,
+            )
             if final
             else ((), (), None)
         )

@@ -65,6 +65,9 @@ class Calibration:
         Why a sensor is not calibrated. Its noise has no budget.
     without_noise : tuple of ChannelLabel
         Calibrated channels whose mean noise is not positive, and that have no budget of it.
+    untested : tuple of str
+        Sensors, the reference among them, of which no test tells what may bend them: U has none of
+        it.
     """
 
     reference: int
@@ -75,6 +78,7 @@ class Calibration:
     confidence: float
     refused: dict[int, str] = field(default_factory=dict)
     without_noise: tuple[ChannelLabel, ...] = ()
+    untested: tuple[str, ...] = ()
 
     def whole_band(self, quantity: str) -> tuple[Budget, ...]:
         """Return the budgets of a quantity in the widest band."""
@@ -158,7 +162,17 @@ def calibrate(
         confidence=confidence,
         refused=refused,
         without_noise=tuple(without_noise),
+        untested=_untested(snapshot),
     )
+
+
+def _untested(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return the sensors whose linearity too few segments, or none, tell."""
+    bends = np.full(len(snapshot.channels), np.nan) if snapshot.bends is None else snapshot.bends
+    unknown = set(np.flatnonzero(np.isnan(bends)).tolist())
+    unknown -= {each.column for each in snapshot.nonlinear}
+    found = {label.sensor for n, label in enumerate(snapshot.channels) if n in unknown}
+    return tuple(name for name in snapshot.sensor_names if name in found)
 
 
 class _Work:
@@ -379,7 +393,7 @@ class _Work:
         """
         psd = self.snapshot.data_psd[inside]
         bends = self.snapshot.bends
-        squares = np.zeros(len(self.snapshot.channels)) if bends is None else bends**2
+        squares = np.zeros(len(psd[0])) if bends is None else np.nan_to_num(bends) ** 2
         for each in self.snapshot.nonlinear:
             share = float(each.explained[inside].sum() / psd[:, each.column].sum())
             squares[each.column] = max(squares[each.column], 1.5 * share)

@@ -30,7 +30,6 @@ MOST_SEGMENTS = 48
 MOST_BINS = 200
 MOST_PREDICTORS = 12
 MOST_VALUES = 2_000_000
-"""Values of the segments' spectra that are kept at all frequencies."""
 LEAST_LEFT = 12
 """Segments beyond the predictors without which nothing is tested."""
 PEAK = 6.0
@@ -42,6 +41,9 @@ CERTAIN = 5.0
 """Standard deviations of the evidence from which a channel is not linear."""
 ROUNDS = 6
 _TERMS = 2  # square and cube
+_SUMS = 10  # of one kind of cube
+_SEEN = 3.0  # standard errors from which on a cube is seen
+_FAR = 4.0  # standard deviations of what others leave, beyond which a sample pulls
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +75,29 @@ class SquaresAndCubes:
     welch : WelchSettings
     highest : float
         Frequency in Hz up to which averages are known.
+    more : int
+        Further frequencies, evenly spaced, and cubes of steps from sample to sample, for `bends`.
+    most_values : int
+        Values of the segments' spectra that are kept at all frequencies.
     """
 
-    def __init__(self, welch: WelchSettings, highest: float) -> None:
+    def __init__(
+        self,
+        welch: WelchSettings,
+        highest: float,
+        *,
+        more: int = 0,
+        most_values: int = MOST_VALUES,
+    ) -> None:
         self._window = get_window(welch.window, welch.segment_length)
         known = np.flatnonzero(
             (welch.frequencies >= max(welch.lowest, welch.frequencies[1]))
             & (welch.frequencies <= min(highest, 0.95 * welch.sampling_rate / 2))
         )
         wanted = np.geomspace(known[0], known[-1], MOST_BINS) if len(known) else np.empty(0)
-        self.bins: IntArray = np.array(sorted(set(np.round(wanted).astype(int).tolist())), np.int64)
+        even = known[np.linspace(0, len(known) - 1, min(len(known), more)).astype(np.int64)]
+        chosen = {*np.round(wanted).astype(int).tolist(), *even.tolist()}
+        self.bins: IntArray = np.array(sorted(chosen), np.int64)
         self.frequency = welch.frequencies[self.bins]
         self._density = 2 / (welch.sampling_rate * float(self._window @ self._window))
         self._scale: FloatArray | None = None
@@ -92,6 +107,8 @@ class SquaresAndCubes:
         self._means: list[FloatArray] = []
         self._past: list[FloatArray] = []
         self._first: FloatArray | float = 0.0
+        self._most_values = most_values
+        self._more, self._sums = more > 0, np.zeros((2, _SUMS, 1))
         self._frequencies, self._highest = welch.frequencies, float(self.frequency.max(initial=0))
 
     def add(self, samples: FloatArray, past: FloatArray | None = None) -> None:
@@ -110,12 +127,16 @@ class SquaresAndCubes:
         x = centred / self._scale[:, None]
         square = x**2
         power = (square @ self._window**2) / (self._window @ self._window)
+        terms: list[FloatArray] = [x, square, x * (square - 3 * power[:, None])]
+        if self._more:
+            step = np.diff(x, prepend=x[:, :1])
+            of_steps = (step**2 @ self._window**2) / (self._window @ self._window)
+            terms.append(step * (step**2 - 3 * of_steps[:, None]))
+            power = np.stack([power, of_steps])
         self._powers.append(power)
-        terms = np.stack([x, square, x * (square - 3 * power[:, None])])
-        terms *= self._window
-        spectra = np.fft.rfft(terms).astype(np.complex64)
+        spectra = np.fft.rfft(np.stack(terms) * self._window).astype(np.complex64)
         self._spectra.append(spectra[:, :, self.bins].transpose(2, 1, 0))
-        if len(self._whole) * spectra[0].size < MOST_VALUES:
+        if len(self._whole) * spectra[0].size < self._most_values:
             self._whole.append(spectra[:1].copy())  # a view would keep squares and cubes
             self._means.append((mean - self._first) / self._scale)
             self._past.append(np.zeros(len(size)) if past is None else past)
@@ -151,8 +172,64 @@ class SquaresAndCubes:
             found.append(replace(best, explained=scale * best.explained))
         return found
 
+    def gather(self, sensor: IntArray) -> None:
+        """Take the segments into the sums of which `bends` is made, and drop them.
+
+        `sensor`: of each channel.
+        """
+        spectra, powers = np.array(self._spectra), np.array(self._powers)
+        self._spectra, self._powers = [], []
+        if len(spectra) < LEAST_LEFT or not len(self.bins):
+            return
+        powers = powers.reshape(len(spectra), -1, len(sensor))
+        found = np.zeros((len(powers[0]), _SUMS, len(sensor)))
+        found[:, 0], found[:, 1] = (powers**2).sum(axis=0), powers.sum(axis=0)
+        turned = 1 - np.cos(2 * np.pi * self.bins / len(self._window))
+        for one in range(int(sensor.max()) + 1):
+            own = np.flatnonzero(sensor == one)
+            rest, left = _rest(spectra, sensor, own.tolist(), [])
+            if left < LEAST_LEFT:
+                continue
+            r = rest[..., 0]
+            x = spectra[:, :, own, 0].swapaxes(0, 1).astype(np.complex128)
+            noise = np.maximum(np.mean(np.abs(r) ** 2, axis=1), np.finfo(np.float64).tiny)
+            loud = np.mean(np.abs(x) ** 2, axis=1)
+            heard = loud / (loud + noise)
+            shares = np.ones(len(own)), turned @ heard / heard.sum(axis=0)
+            for kind, q in enumerate(np.moveaxis(rest[..., 2:], -1, 0)):
+                along = np.einsum("fkc,fkc,fc->kc", q.conj(), r, 1 / noise).real
+                size = np.einsum("fkc,fkc,fc->kc", q.conj(), q, 1 / noise).real
+                products = np.stack([along**2, along * size, size**2]).sum(axis=1)
+                found[kind, 2:4, own] = np.stack([along.sum(axis=0), size.sum(axis=0)]).T
+                found[kind, 4:7, own] = len(spectra) / left * products.T
+                found[kind, 7, own] = shares[kind] * size.sum(axis=0)
+            # what few segments leave, and what predicts them, are both too small
+            pulled = (len(spectra) / left) ** 2 * self._pulled(x, r)
+            found[0, 8:, own] = len(spectra) * np.stack([pulled, np.ones(len(own))]).T
+        self._sums = self._sums[: len(found)] + found
+
+    def _pulled(self, x: ComplexArray, rest: ComplexArray) -> FloatArray:
+        """Return what samples far beyond what others leave take off a gain.
+
+        As where a channel stands still for moments. 0 where frequencies are left out.
+        """
+        if len(self.bins) < self.bins[-1] - self.bins[0] + 1:
+            return np.zeros(x.shape[2])
+        n = len(self._window)
+        both = np.zeros((2, n // 2 + 1, *x.shape[1:]), np.complex128)
+        both[:, self.bins] = x - rest, rest  # what others predict, and what they leave
+        whole = self._window > self._window.max() / 2
+        predicted, left = np.fft.irfft(both, n, axis=1)[:, whole] / self._window[whole, None, None]
+        size = np.median(np.abs(left), axis=(0, 1)) / 0.6745
+        far = np.where(np.abs(left) > _FAR * size, left, 0.0)
+        taken = np.einsum("tkc,tkc->c", far, predicted)
+        whole_power = np.einsum("tkc,tkc->c", predicted, predicted)
+        return np.asarray(taken / np.maximum(whole_power, np.finfo(np.float64).tiny))
+
     def bends(self, sensor: IntArray) -> FloatArray:
         """Return by how much what bends a channel may change its gain, as a standard uncertainty.
+
+        Of the segments that were gathered, and of those that are there, which are dropped.
 
         Parameters
         ----------
@@ -162,32 +239,25 @@ class SquaresAndCubes:
         Returns
         -------
         float64, shape (n_channels,)
-            Relative, at the loudness of the segments. A cube ``c x**3`` changes it by
-            ``3 c s**2``, with s the standard deviation; a dead zone by twice what its cube does.
-            One real c of all frequencies, or its standard error, where that is larger. It has
-            a part of what another sensor bends.
+            Relative, at the loudness of the segments; NaN where too few segments tell. A cube
+            ``c x**3`` changes it by ``3 c s**2``, with s the standard deviation; a dead zone by
+            twice what its cube does, and play by twice what a cube of steps from sample to sample
+            does. One real c of all frequencies, with its standard error where it is seen, or else
+            the larger of both. And what moments without motion take. It has a part of what
+            another sensor bends.
         """
-        found = np.zeros(len(sensor))
-        if self._scale is None or len(self._spectra) < LEAST_LEFT or not len(self.bins):
-            return found
-        spectra = np.array(self._spectra)
-        power = np.array(self._powers)
-        loudness = (power**2).sum(axis=0) / power.sum(axis=0)
-        for one in range(int(sensor.max()) + 1):
-            own = np.flatnonzero(sensor == one)
-            rest, left = _rest(spectra, sensor, own.tolist(), [])
-            if left < LEAST_LEFT:
-                continue
-            r, q = rest[..., 0], rest[..., 2]
-            weight = 1 / np.maximum(np.mean(np.abs(r) ** 2, axis=1), np.finfo(np.float64).tiny)
-            along = np.einsum("fkc,fkc,fc->kc", q.conj(), r, weight).real
-            size = np.einsum("fkc,fkc,fc->kc", q.conj(), q, weight).real
-            whole = np.maximum(size.sum(axis=0), np.finfo(np.float64).tiny)
-            cube = along.sum(axis=0) / whole
-            error = np.sqrt(len(r[0]) / left * np.sum((along - cube * size) ** 2, axis=0)) / whole
-            most = 6 * np.maximum(np.abs(cube), error) * loudness[own]
-            found[own] = np.fmin(most / np.sqrt(3), 1.0)  # of a rectangular distribution
-        return found
+        self.gather(sensor)
+        fourth, second, along, size, squares, products, sizes, parts, pulled, n = (
+            self._sums.swapaxes(0, 1)
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cube = along / size
+            left = np.maximum(squares - 2 * cube * products + cube**2 * sizes, 0.0)
+            cube, error = np.abs(cube), np.sqrt(left) / size
+            limit = np.where(cube > _SEEN * error, cube + error, np.maximum(cube, error))
+            most = 6 / np.sqrt(3) * limit * fourth / second * parts / size  # rectangular
+            most = np.sqrt(np.sum(most**2, axis=0) + (pulled[0] / n[0]) ** 2)
+        return np.broadcast_to(np.minimum(most, 1.0), sensor.shape)
 
     def dependences(self, sensor: IntArray) -> list[Dependence]:
         """Return where noise depends on the motion otherwise, the clearest first.
@@ -249,7 +319,7 @@ def _rest(
     ).transpose(1, 0, 2)
     wanted = spectra[:, :, own].reshape(*spectra.shape[:2], -1).transpose(1, 0, 2)
     rest = without(predictors.astype(np.complex128), wanted.astype(np.complex128))
-    return rest.reshape(*rest.shape[:2], len(own), 1 + _TERMS), left
+    return rest.reshape(*rest.shape[:2], len(own), -1), left
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:

@@ -61,7 +61,7 @@ def calibrate(
     from tui.output.json_document import calibration_document
 
     check_places(json)
-    result = estimated(files, whole=True, **wanted)
+    result = estimated(files, whole=True, calibrates=True, **wanted)
     snapshot = result.snapshot
     found = calibrate(result, result.bench, reference=reference, confidence=confidence)
     screen = for_people(json)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -179,12 +180,14 @@ def estimated(
     start: str | None,
     end: str | None,
     whole: bool = False,
+    calibrates: bool = False,
     jobs: int = 1,
     **wanted: Any,  # noqa: ANN401 - fields of EstimateSettings
 ) -> Result:
     """Estimate recordings, showing the progress.
 
     The whole bench takes as long to read as to estimate: without limits only where it is wanted.
+    `calibrates` is that of `Settings`.
     """
     from daq.errors import NotARecordingError
     from daq.estimation.estimation import estimate
@@ -201,6 +204,7 @@ def estimated(
         counted("segments", then=TESTING) as count,
     ):
         settings = settings_of(first, start=start, end=end, **wanted)
+        settings = replace(settings, calibrates=calibrates)
         snapshot = estimate([first, *files[1:]], settings, progress=count, jobs=jobs)
     outline = first.outline
     bench = first.bench if whole or (outline is not None and outline.has_limits) else None

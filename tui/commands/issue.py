@@ -109,7 +109,7 @@ def issue(
         )
     if not is_specimen:
         examined.check()
-    result = estimated(files, whole=True, **wanted)
+    result = estimated(files, whole=True, calibrates=True, **wanted)
     with notices().status("making the certificate"):
         if is_specimen:
             place = files[0].absolute().parent if folder is None else folder

@@ -74,7 +74,7 @@ def report(
 
     masks = masks_named(models)
     out = checked(files[0].with_suffix(".html") if out is None else out)
-    result = estimated(files, whole=True, **wanted)
+    result = estimated(files, whole=True, calibrates=True, **wanted)
     taken: Taken = "replace" if force else "refuse"
     write_report(result, out, models=masks, taken=taken, screen=console())
     exit_with(result.verdict)

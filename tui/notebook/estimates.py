@@ -238,6 +238,18 @@ def estimate(
     >>> result.unit
     'm/s²'
     """
+    return estimated(recordings, start=start, end=end, **options)
+
+
+def estimated(
+    recordings: PathLike | Iterable[PathLike],
+    *,
+    start: Time | None = None,
+    end: Time | None = None,
+    calibrates: bool = False,
+    **options: Unpack[EstimateOptions],
+) -> Result:
+    """Return what `estimate` does; `calibrates` is that of `Settings`."""
     if isinstance(recordings, (str, os.PathLike)):
         recordings = [recordings]
     if not isinstance(recordings, Iterable):
@@ -251,7 +263,10 @@ def estimate(
         check_fit(settings, recording.sensors, called=called)
         created, recorded = recording.created, _recorded(recording)
     settings = replace(
-        settings, start=moment("start", start, created), end=moment("end", end, created)
+        settings,
+        start=moment("start", start, created),
+        end=moment("end", end, created),
+        calibrates=calibrates,
     )
     with Estimation(paths, settings) as estimation:
         return Result(estimation.finish(), settings, bench, paths, recorded)

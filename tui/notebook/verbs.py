@@ -17,7 +17,7 @@ from daq.errors import WrongSettingError
 from daq.results.calibration import CONFIDENCE, Calibration
 from daq.results.calibration import calibrate as calibrated
 from tui.notebook.curve_files import MINISEED, WRITERS, loaded, write_curves, write_samples
-from tui.notebook.estimates import PathLike, estimate
+from tui.notebook.estimates import PathLike, estimated
 from tui.notebook.result import Result
 from tui.output.extras import require
 from tui.output.json_document import provenance
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 _SUFFIXES = (".html", ".htm", ".pdf")
 
 
-def _result(given: Estimated, options: EstimateOptions) -> Result:
+def _result(given: Estimated, options: EstimateOptions, *, calibrates: bool = False) -> Result:
     if not isinstance(given, Result):
-        return estimate(given, **options)
+        return estimated(given, calibrates=calibrates, **options)
     if options:
         raise WrongSettingError(
             f"{', '.join(options)} with a Result; expected recordings, or options where the"
@@ -60,7 +60,8 @@ def calibrate(
     Parameters
     ----------
     result : Result, path or iterable of paths
-        An estimate, or recordings to estimate.
+        An estimate, or recordings to estimate. Uncertainties are larger with an estimate: some of
+        its segments tell what may bend a channel, of recordings all.
     reference : str, optional
         Name of the sensor; by default the first with certificates, or else the first of all.
     confidence : float
@@ -80,7 +81,7 @@ def calibrate(
     EstimatorError
         If no sensor can be compared with the reference.
     """
-    found = _result(result, options)
+    found = _result(result, options, calibrates=True)
     return calibrated(found.result, found.bench, reference=reference, confidence=confidence)
 
 
@@ -171,7 +172,7 @@ def report(
     if out.suffix.lower() not in _SUFFIXES:
         raise WrongSettingError(f"{out}: expected a file name that ends in .html or .pdf")
     require("matplotlib", "jinja2", *(["fpdf"] if out.suffix.lower() == ".pdf" else []))
-    found = _result(result, options)
+    found = _result(result, options, calibrates=True)
     if not found.recordings:
         raise WrongSettingError(
             "the estimate is of arrays; expected recordings, whose checksums a report states:"

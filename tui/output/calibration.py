@@ -9,7 +9,7 @@ from daq.bench.units import decibels
 from daq.clocks.clock_model import RelativeTime
 from daq.results.clock_effect import relative_time
 from daq.results.uncertainty_budget import Budget, student_quantile
-from estimator.wording import signed, span
+from estimator.wording import listed, signed, span
 from tui.page.table import Table
 from tui.wording.formatting import plain_number
 
@@ -252,6 +252,12 @@ def remarks(found: Calibration, snapshot: Snapshot) -> list[str]:
         "Noise that a sensor or the reference shares with a third one biases the sensitivity by "
         "its share of the motion; with three sensors it cannot be seen."
     )
+    if found.untested:
+        lines.append(
+            f"{listed(found.untested)}: too few segments tell whether they are linear, and "
+            "uncertainties do not include that they may not be. Record longer, or choose shorter "
+            "segments."
+        )
     lines += _times(found, snapshot)
     lines += [
         f"{snapshot.sensor_names[each.sensor]}: the cycle of its delay is ambiguous in so "

@@ -494,6 +494,7 @@ class CalibrationDocument(TypedDict):
     confidence: Annotated[Finite, "Level of the expanded uncertainties."]
     refused: Annotated[Mapping[str, str], "Why a sensor is not calibrated, by sensor."]
     without_noise: Annotated[list[str], "Channels without a budget of the noise."]
+    untested: Annotated[list[str], "Sensors of whose linearity too few segments tell."]
     sensors: Annotated[
         list[Annotated[SensorCalibration, CalibratedKeys]], "Each other sensor, over the band."
     ]

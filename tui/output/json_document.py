@@ -353,6 +353,7 @@ def calibration_document(found: Calibration, snapshot: Snapshot) -> CalibrationD
         "confidence": found.confidence,
         "refused": {names[sensor]: why for sensor, why in found.refused.items()},
         "without_noise": [label.name for label in found.without_noise],
+        "untested": list(found.untested),
         "sensors": [
             plain(each)
             | {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -12,10 +13,12 @@ from daq.estimation.estimation import estimate
 from daq.estimation.segments.segment_pass import Pass
 from daq.estimation.settings import Settings
 from daq.formats.arrays import recording_of_arrays
+from daq.formats.memory import RecordingInMemory
 from daq.results.band_summary import Spectrum
 from daq.results.calibration import calibrate
 from daq.results.facts.channels import NoiseDependsOnMotion, NotLinear, RoundedAlike
 from daq.results.result import Result
+from daq.results.uncertainty_budget import Budget
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_noise import ResponseChanges
 from estimator.checks.instants import Form
@@ -192,26 +195,68 @@ def test_a_dead_zone_beside_red_motion_leaves_noise_no_lower_end_anywhere() -> N
     assert ((low[:, 1] < 2 / RATE) & (high[:, 1] > 2 / RATE)).all()
 
 
-@pytest.mark.parametrize("kind", ["tanh", "dead zone", "stands still"])
-def test_what_bends_a_channel_unseen_is_in_the_uncertainty_of_its_gain(kind: str) -> None:
-    """At 20 dB, no test shows what takes 1/144 or 1.6 % of a gain, or what it lacks for 1 %."""
-    rng = np.random.default_rng([47, 3])
-    motion = 10 * rng.standard_normal((N_SAMPLES, 1))
-    arrays = {name: motion + rng.standard_normal((N_SAMPLES, 1)) for name in "ABC"}
+def bent(kind: str, n: int = N_SAMPLES, seed: int = 3) -> RecordingInMemory:
+    """Three sensors at 20 dB, the second of which is bent unseen."""
+    rng = np.random.default_rng([47, seed])
+    motion = 10 * rng.standard_normal((n, 1))
+    arrays = {name: motion + rng.standard_normal((n, 1)) for name in "ABC"}
     if kind == "tanh":
         arrays["B"] += 120 * np.tanh(motion / 120) - motion
     elif kind == "dead zone":
         arrays["B"] -= np.clip(motion, -0.2, 0.2)
-    else:
-        for at in range(1000, N_SAMPLES, 3000):
+    elif kind == "play":  # less than a step: the last direction decides
+        arrays["B"] -= 0.2 * np.sign(np.diff(motion, axis=0, prepend=0.0))
+    elif kind == "stands still":
+        for at in range(1000, n, 3000):
             arrays["B"][at : at + 30] = 0.0
-    snapshot = estimate([recording_of_arrays(arrays, sampling_rate=RATE)], Settings(segment=5.0))
-    found = calibrate(Result(snapshot, Settings(segment=5.0)), None)
-    (gain, *_), (steady, *_) = (
-        [each for each in found.whole_band("sensitivity") if each.sensor == name] for name in "BC"
+    return recording_of_arrays(arrays, sampling_rate=RATE)
+
+
+def gains_of(recording: RecordingInMemory, *, calibrates: bool) -> list[Budget]:
+    settings = Settings(segment=5.0, calibrates=calibrates)
+    return list(
+        calibrate(Result(estimate([recording], settings), settings), None).whole_band("sensitivity")
     )
-    assert abs(gain.value - 1) < gain.expanded < 0.04
-    assert abs(steady.value - 1) < steady.expanded < 0.02
+
+
+@pytest.mark.parametrize(
+    ("kind", "calibrates", "within", "steadily"),
+    [
+        ("tanh", False, 1.0, 0.02),
+        ("dead zone", False, 1.0, 0.02),
+        ("stands still", False, 1.0, 0.02),
+        ("tanh", True, 1.0, 0.015),
+        ("dead zone", True, 1.0, 0.02),
+        ("stands still", True, 0.7, 0.01),
+        ("play", True, 0.7, 0.015),
+    ],
+)
+def test_what_bends_a_channel_unseen_is_in_the_uncertainty_of_its_gain(
+    kind: str, calibrates: bool, within: float, steadily: float
+) -> None:
+    """At 20 dB, no test shows what takes 1/144 or 1.6 % of a gain, or what it lacks for 1 %."""
+    gain, steady = gains_of(bent(kind), calibrates=calibrates)
+    assert abs(gain.value - 1) < within * gain.expanded < within * 0.04
+    assert abs(steady.value - 1) < steady.expanded < steadily
+
+
+def test_what_may_bend_channels_is_less_in_longer_recordings() -> None:
+    """By the root of the length, and for some segments hardly more than the gains' scatter."""
+    short, long, some = (
+        max(each.expanded for each in gains_of(bent("", n, 5), calibrates=calibrates))
+        for n, calibrates in ((N_SAMPLES, True), (6 * N_SAMPLES, True), (6 * N_SAMPLES, False))
+    )
+    assert long == pytest.approx(short / 6**0.5, rel=0.25)
+    assert some > 2 * long
+
+
+def test_too_few_segments_tell_of_no_linearity_and_that_is_said() -> None:
+    recording, settings = bent("", 6_000), Settings(segment=5.0, calibrates=True)
+    few = replace(settings, segment=10.0)
+    told, untold = (
+        calibrate(Result(estimate([recording], each), each), None) for each in (settings, few)
+    )
+    assert (told.untested, untold.untested) == ((), ("A", "B", "C"))
 
 
 def test_without_motion_no_segment_is_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
