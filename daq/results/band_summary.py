@@ -143,14 +143,16 @@ class Levels:
         low, high : float64, shape (n_bands, n_channels)
             No upper end is above that of the bound. Where the whole interval is, or none of it is
             above zero, the estimate is withdrawn: the lower end is then minus infinity, and the
-            upper one that of the bound.
+            upper one that of the bound. How far an estimate is below zero lowers no upper end: that
+            is what an estimate of zero would have (Cowan et al., arXiv:1105.3166).
         """
         low, high = widened(
             *self.of_scatter.interval(quantile), self.contributions, without=without
         )
         most = self._most(quantile)
         low = np.where((low > most) | (high < 0), -np.inf, low)
-        high = np.where(np.isnan(high), high, np.where(high < 0, most, np.fmin(high, most)))
+        high = np.where(high < 0, np.inf, high - np.minimum(np.nan_to_num(self.mean), 0.0))
+        high = np.where(np.isnan(high), high, np.fmin(high, most))
         if not factor:
             return low, high
         reach = quantile * deviation(self.contributions, without=without)

@@ -211,6 +211,18 @@ def test_an_interval_below_zero_is_withdrawn() -> None:
     assert np.isposinf(high).all()
 
 
+def test_how_far_an_estimate_is_below_zero_lowers_no_upper_end() -> None:
+    """Noise was passed at a thirtieth of its level, by a motion that lacked a direction."""
+    found = bounded_by(100.0)
+    end = found.of_scatter.interval()[1] - found.mean  # nearly: the interval is not symmetrical
+    found = replace(found, of_scatter=replace(found.of_scatter, mean=-0.98 * end))
+    by_scatter = found.of_scatter.interval()[1]
+    positive = by_scatter > 0
+    assert positive.any()
+    assert (by_scatter < 0.5 * end)[positive].all()
+    assert (found.ends()[1] > 0.9 * end)[positive].all()
+
+
 def test_a_level_below_its_bound_keeps_its_ends() -> None:
     found = bounded_by(100.0)
     low, high = found.ends()
