@@ -609,7 +609,8 @@ def _misfits(
     every = may_share(snapshot)[0]
     found = {source: np.zeros(psd.shape) for source in (Source.MISFIT, Source.SHARED_NOISE)}
     for advice in snapshot.diagnostics.advice:
-        if advice.band is None or advice.rank is Rank.TO_KNOW:
+        is_stranger = isinstance(advice, NoSharedMotion)
+        if advice.band is None or (advice.rank is Rank.TO_KNOW and not is_stranger):
             continue
         here = (frequency >= advice.band[0]) & (frequency <= advice.band[1])
         source, error = Source.MISFIT, 0.0
@@ -624,7 +625,7 @@ def _misfits(
         elif isinstance(advice, TooFewDimensions):
             here &= ~explained
             error = math.inf
-        elif isinstance(advice, NoSharedMotion) and len(snapshot.dims) == _THREE:
+        elif is_stranger and len(snapshot.dims) == _THREE:
             error = math.inf
         found[source][here] = np.maximum(found[source][here], error)
     return found

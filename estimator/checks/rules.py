@@ -266,22 +266,25 @@ def _strangers(
     """Yield advice on sensors that record none of the motion shared by others.
 
     Other findings in these bands are consequences, and not reported. Weak motion may be hidden by
-    the noise of a sensor that shares it elsewhere.
+    the noise of a sensor that shares it elsewhere: that is to know, and bounds its noise.
     """
     of_bands = [dict(outsiders(band.shared, n_effective, band.n_frequencies)) for band in bands]
     starts = np.cumsum([0, *dims[:-1]])
     strong = [np.fmax.reduceat(band.snr, starts) for band in bands]
     for sensor in range(len(dims)):
         shares = any(np.any(band.shared[sensor] >= MIN_OF_ONE) for band in bands)
-        named = [
-            sensor in found and not (shares and np.min(snr[list(found[sensor])]) < HIDDEN)
+        hidden = [
+            None
+            if sensor not in found
+            else bool(shares and np.min(snr[list(found[sensor])]) < HIDDEN)
             for found, snr in zip(of_bands, strong, strict=True)
         ]
-        for is_stranger, run in groupby(range(len(bands)), named.__getitem__):
+        for is_hidden, run in groupby(range(len(bands)), hidden.__getitem__):
             here = list(run)
-            if is_stranger:
+            if is_hidden is not None:
                 groups = [of_bands[n][sensor] for n in here]
-                yield _stranger(sensor, [bands[n] for n in here], groups)
+                found = _stranger(sensor, [bands[n] for n in here], groups)
+                yield replace(found, rank=Rank.TO_KNOW) if is_hidden else found
 
 
 def _stranger(

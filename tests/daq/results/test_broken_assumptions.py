@@ -53,6 +53,20 @@ def white(rng: np.random.Generator, n_sensors: int) -> np.ndarray:
     return rng.standard_normal((n_sensors, N_SAMPLES, 3))
 
 
+@pytest.mark.parametrize("n_sensors", [3, 4])
+def test_weak_motion_of_its_own_may_be_all_noise_of_a_sensor(n_sensors: int) -> None:
+    """Below 5 Hz all feel one motion; above, the last one another, of three times its noise."""
+    rng = np.random.default_rng(6)
+    noise, motion = white(rng, n_sensors), felt(rng, n_sensors, 100.0)
+    below = np.fft.rfftfreq(N_SAMPLES, 1 / RATE)[:, None] < 5.0
+    for n, each in enumerate(motion):
+        spectrum = np.fft.rfft(each, axis=0)
+        weak = np.fft.rfft(10 * rng.standard_normal((N_SAMPLES, 3)), axis=0)
+        above = np.sqrt(0.03) * (weak if n == n_sensors - 1 else spectrum)
+        motion[n] = np.fft.irfft(np.where(below, spectrum, above), N_SAMPLES, axis=0)
+    assert held(estimated(motion, noise), noise)[2:, -3:].all()
+
+
 def test_noise_of_a_sensor_that_feels_other_motion_has_no_lower_end() -> None:
     rng = np.random.default_rng(6)
     noise, motion = white(rng, 5), felt(rng, 5, 100.0)

@@ -136,13 +136,14 @@ def test_a_sensor_coherent_only_at_low_frequencies_is_reported_above_them() -> N
     assert advice.band[1] == 20.0
 
 
-def test_weak_motion_that_the_noise_of_a_sensor_hides_is_not_missing_there() -> None:
+def test_weak_motion_that_the_noise_of_a_sensor_hides_is_to_know() -> None:
     """It has 14 dB more noise than the others, and is coherent with them at low frequencies."""
     strength = 100.0 / FREQUENCY[:, None, None] ** 1.5
     noise = np.repeat([1.0, 1.0, 25.0], 3)
     csm = strength * bench(*3 * [np.eye(3)], motion=np.eye(3)) + np.diag(noise)
     for seed in range(4):
-        assert advice_of(NoSharedMotion, of(averages(csm, n=200, seed=seed), n=200)) == []
+        found = advice_of(NoSharedMotion, of(averages(csm, n=200, seed=seed), n=200))
+        assert {each.rank for each in found} <= {Rank.TO_KNOW}
 
 
 def test_rotated_sensors_are_found_with_their_angle() -> None:
