@@ -121,6 +121,10 @@ class DiskError(RecordingError):
     """The disk repeatedly refused to store a recording."""
 
 
+class RemovedError(DiskError):
+    """A recording was removed while it grew, with all that was safe in it."""
+
+
 class NotARecordingError(RecordingError):
     """The file is not a huddle recording, or has a newer format than this version reads."""
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -38,7 +37,6 @@ from daq.recording.storage import locking
 INTERVAL = 20.0
 """Seconds between returns, at least."""
 _M_ARENA_MAX, _HEAPS = -8, 2  # of malloc.h
-_LOOKS, _RENAMED = 4, 0.5  # seconds: a recorder gives a file that was renamed its name back
 
 
 class FreedMemory:
@@ -372,8 +370,8 @@ class _Sensors:
 class _RemoteRecorder:
     """A recorder that another process started.
 
-    It is gone when nobody holds the lock of the file. Where that cannot be seen, it is asked
-    whether it runs when no sample comes.
+    It is gone when nobody holds the lock of the file that was opened. Where that cannot be seen, it
+    is asked whether it runs when no sample comes.
     """
 
     def __init__(self, recording: Recording, cancelled: threading.Event, silence: float) -> None:
@@ -384,10 +382,7 @@ class _RemoteRecorder:
     @property
     def ended(self) -> bool:
         if locking.LOCKS_ARE_VISIBLE:
-            for _ in range(_LOOKS):
-                if sys.platform == "linux" and not self._recording.path.exists():
-                    self._wait(_RENAMED)
-            return not locking.is_being_written(self._recording.path)
+            return not locking.is_being_written(self._recording.opened)
         n_samples = sum(sensor.n_samples for sensor in self._recording.sensors)
         now = time.monotonic()
         if n_samples != self._n_samples:

@@ -297,8 +297,11 @@ class BlockWriter:
         self._unsafe_events.clear()
         return committed
 
-    def continue_in(self, writer: RecordingWriter) -> None:
-        """Continue in another file, and write the unacknowledged items there."""
+    def continue_in(self, writer: RecordingWriter, *, lost: bool = False) -> None:
+        """Continue in another file, and write the unacknowledged items there.
+
+        `lost`: what was safe in the file before is safe no longer.
+        """
         before, self._writer = self._writer, writer
         before.abandon()  # last: a follower that sees its end looks for the next file
         events, self._unsafe_events = self._unsafe_events, []
@@ -309,8 +312,8 @@ class BlockWriter:
             else:
                 writer.reading(event)
         for name, sensor in self._sensors.items():
-            sensor.rows_before += sensor.unsafe.safe.rows
-            sensor.gaps_before += sensor.unsafe.safe.gaps
+            sensor.rows_before += 0 if lost else sensor.unsafe.safe.rows
+            sensor.gaps_before += 0 if lost else sensor.unsafe.safe.gaps
             rest = sensor.unsafe.taken()
             sensor.base = min(
                 (item.first_sample for item in rest), default=sensor.indexer.next_sample

@@ -31,7 +31,7 @@ from daq.bench.model import Bench, Sensor
 from daq.devices.bench_file import caveats_of
 from daq.devices.interface import AnyDriver
 from daq.devices.registry import driver_type
-from daq.errors import DeviceError, DiskError, RecordingError
+from daq.errors import DeviceError, DiskError, RecordingError, RemovedError
 from daq.host_clock import HostClock, SystemClock
 from daq.protocols.block import Event, EventKind, Quantity, Reading, ReadingTimes, Uncounted
 from daq.protocols.errors import RemoteProtocolError
@@ -408,24 +408,26 @@ class _Recorder:
         now, before = self.clock.now(), self._file
         lasted = (now.monotonic_ns - self._file_started.monotonic_ns) / 1e9
         if before != self._path and lasted < MIN_CONTINUATION:
-            raise DiskError(f"{error}; {self._safe()}") from error
+            raise DiskError(f"{error}; {self._safe(error)}") from error
         path = next(each for each in continuation_names(self._path) if not each.exists())
         attributes = {**self.attributes, CONTINUES: self._writer.run_id}
         following = None
         try:
             following = self._new_file(path, created=now, attributes=attributes)
-            self._writer.continue_in(following)
+            self._writer.continue_in(following, lost=isinstance(error, RemovedError))
         except RecordingError:
             if following is not None:
                 following.discard()
-            raise DiskError(f"{error}; {self._safe()}") from error
+            raise DiskError(f"{error}; {self._safe(error)}") from error
         self._file, self._file_started = path, now
         _LOGGER.error("%s; the recording continues in %s", error, path)
         text = f"continues {error}"
         self._writer.write([Event("", EventKind.STATUS, text, now)])
 
-    def _safe(self) -> str:
+    def _safe(self, error: DiskError) -> str:
         """Return how much of each sensor is safe on the disk."""
+        if isinstance(error, RemovedError):
+            return "what was in it is lost"
         rates = {sensor.name: sensor.sampling_rate for sensor in self.bench.sensors}
         seconds = [one.samples / rates[name] for name, one in self._status.sensors.items()]
         return f"{min(seconds, default=0.0):.0f} s of every sensor are safe"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import sys
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -104,6 +105,13 @@ class Recording:
         if self.warning and self.run_id not in _NAMED:
             _NAMED.add(self.run_id)
             _LOGGER.warning("%s: %s", path, self.warning)
+
+    @property
+    def opened(self) -> Path:
+        """Path of the open file: on Linux also where its name is gone, or leads to another."""
+        if sys.platform != "linux":
+            return self.path
+        return Path(f"/proc/self/fd/{self._file.id.get_vfd_handle()}")
 
     @classmethod
     def open(cls, path: str | Path, *, tried: bool = False) -> Recording:

@@ -35,7 +35,7 @@ import h5py
 import numpy as np
 
 from daq.bench.tables.unattended import Hooks
-from daq.errors import DiskError, RecordingError
+from daq.errors import DiskError, RecordingError, RemovedError
 from daq.recording import file_format
 from daq.recording.chunks.chunk_writer import SensorRows, TableBuffer
 from daq.recording.chunks.manifest import differences, make_manifest, write_manifest
@@ -498,20 +498,27 @@ class RecordingWriter:
         ------
         DiskError
             If the name leads to another file, or to a copy of what was removed.
+        RemovedError
+            If what was removed cannot be copied.
         """
         place, handle = self._hidden or self.path, self._handle
         if self._journal is not None:
             self._journal.keep_name()
-        has_lost, again = not os.path.lexists(place), ""
-        if has_lost:
-            with contextlib.suppress(OSError, NotImplementedError):
-                give_back(place, handle)
-                again = ", and has it again"
-        if not place.exists() or not os.path.samestat(place.stat(), os.fstat(handle)):
-            what = "lost its name" if has_lost else "was replaced by another file"
-            raise DiskError(f"{place}: {what} while it was recorded{again}")
-        if again:
-            _LOGGER.warning("%s lost its name%s", place, again)
+        found, is_taken = os.fstat(handle), os.path.lexists(place)
+        if place.exists() and os.path.samestat(place.stat(), found):
+            return
+        what = "was replaced by another file" if is_taken else "lost its name"
+        what = f"{place}: {what} while it was recorded"
+        if is_taken and found.st_nlink:
+            raise DiskError(what)
+        try:
+            again = give_back(place, handle)
+        except (OSError, NotImplementedError) as error:
+            kind = DiskError if found.st_nlink else RemovedError
+            raise kind(f"{what}, and cannot be written again: {reason_of(error)}") from error
+        if not found.st_nlink:
+            raise DiskError(f"{what}; what was safe in it is in {again.name}")
+        _LOGGER.warning("%s, and has it again", what)
 
     def _write_again(self) -> None:
         for sensor in self._sensors.values():

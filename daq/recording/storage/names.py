@@ -8,6 +8,7 @@ import itertools
 import os
 import re
 import shutil
+import stat
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
@@ -44,25 +45,30 @@ def publish(temporary: Path, path: Path) -> None:
         raise taken(path) from None
 
 
-def give_back(path: Path, handle: int) -> None:
+def give_back(path: Path, handle: int) -> Path:
     """Give an open file the name that it had: it, or its folder, was renamed or removed (Linux).
 
-    Another name stays. What a file without any name has is copied; the open file stays nameless.
+    Another name stays. What a file without any name has is copied, and the open file stays
+    nameless; where another file has the name, the copy gets that of a continuation. Return the
+    name.
 
     Raises
     ------
     OSError, NotImplementedError
         If the system or the disk cannot.
     """
-    source = f"/proc/self/fd/{handle}"
-    has_name = os.fstat(handle).st_nlink > 0
+    source, found = f"/proc/self/fd/{handle}", os.fstat(handle)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if has_name:  # the link is followed to the open file only where a folder's descriptor is given
+    if found.st_nlink:  # the link is followed to the open file only with a folder's descriptor
         os.link(source, path, src_dir_fd=handle, follow_symlinks=True)
-        return
+        return path
+    if os.path.lexists(path):
+        path = next(each for each in continuation_names(path) if not os.path.lexists(each))
     with replaced(path, free=True) as part:
         create_private(part)
         shutil.copyfile(source, part)
+        part.chmod(stat.S_IMODE(found.st_mode))
+    return path
 
 
 def taken(path: Path) -> RecordingError:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import stat
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 
 from daq.bench.channel import Channel
-from daq.errors import DiskError, RecordingError
+from daq.errors import DiskError, RecordingError, RemovedError
 from daq.estimation.follow import _RemoteRecorder
 from daq.protocols.block import Block, HostTime
 from daq.recording.file_format import SensorLayout
@@ -62,19 +64,47 @@ def test_the_later_of_two_recorders_with_one_name_fails(
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.h5"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the names of open files")
-def test_a_recording_that_is_replaced_goes_on_in_another(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="an open file gets a name by /proc")
+def test_what_was_safe_in_a_replaced_recording_has_another_name(tmp_path: Path) -> None:
     path = tmp_path / "folder" / "r.h5"
     writer = create(path)
     writer.append(Block("a", 0, COUNTS, NOW))
     writer.commit()
+    path.chmod(0o640)
     record(tmp_path / "other.h5")
     (tmp_path / "other.h5").replace(path)
-    with pytest.raises(DiskError, match="was replaced by another file while it was recorded"):
+    with (
+        Recording.open(path.parent / "r.h5"),
+        pytest.raises(
+            DiskError,
+            match=r"was replaced by another file while .*; what was safe in it is in r-2\.h5",
+        ),
+    ):
         writer.commit()
     with pytest.raises(RecordingError):
         writer.close()
     assert verify(path).closed
+    other = path.with_name("r-2.h5")
+    assert stat.S_IMODE(other.stat().st_mode) == 0o640
+    with Recording.open(other) as recording:
+        np.testing.assert_array_equal(recording.sensor("a").counts(), COUNTS)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="an open file gets a name by /proc")
+def test_a_removed_recording_that_cannot_be_copied_is_said_to_be_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: str, _part: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), source)
+
+    monkeypatch.setattr("daq.recording.storage.names.shutil.copyfile", full)
+    path = tmp_path / "r.h5"
+    writer = create(path)
+    path.unlink()
+    with pytest.raises(RemovedError, match="cannot be written again: No space left on device"):
+        writer.commit()
+    writer.abandon()
+    assert not path.exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="an open file gets a name by /proc")
@@ -85,13 +115,18 @@ def test_what_was_safe_in_a_removed_recording_stays(tmp_path: Path, *, with_jour
     writer = create(path)
     writer.append(Block("a", 0, COUNTS[:100], NOW))
     writer.commit()
+    recording = Recording.open(path)
     path.unlink()
     if with_journal:
         journal_path(path).unlink()
     writer.append(Block("a", 100, COUNTS[100:], NOW))
-    with pytest.raises(DiskError, match="lost its name while it was recorded, and has it again"):
+    with pytest.raises(DiskError, match=r"lost its name .*; .* is in r\.h5"):
         writer.commit()
+    remote = _RemoteRecorder(recording, Event(), 1.0)
+    before = remote.ended  # when the recorder has not gone on in another file yet
     writer.abandon()
+    assert (before, remote.ended) == (False, True)
+    recording.close()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     with path.open("r+b") as torn:  # by a power cut: the journal is needed
         torn.write(bytes(48))
