@@ -129,9 +129,7 @@ class RelativeResponse:
     angle_error_deg : float
         Standard error of both angles, from their scatter over parts of the band.
     rotation_error_deg : float
-        Standard error of the rotation, of its three components together. Axes that are not at
-        right angles, and unequal gains of `first`, which look like them, make the rotation unclear
-        by as much.
+        Standard error of the rotation, of its three components together.
     gains, gain_errors : float64, shape (d,)
         Gains of the channels of `second` over those of `first`, and their standard errors. These
         are infinite where the phase turns over the band, so that sums over it cancel.
@@ -174,6 +172,16 @@ class RelativeResponse:
     delay_error: Seconds
     is_ambiguous: bool
     coherence: float
+
+    @property
+    def rotation_uncertainty_deg(self) -> float:
+        """Standard uncertainty of the rotation.
+
+        Axes that are not at right angles, and unequal gains of `first`, which look like them, make
+        it unclear by as much.
+        """
+        skew = self.nonorthogonality_deg**2 - self.nonorthogonality_error_deg**2
+        return math.hypot(self.rotation_error_deg, math.sqrt(max(skew, 0.0)))
 
 
 def relative_response(
@@ -395,7 +403,6 @@ def _response(
     gain_errors[cancels[0].any() | cancels[1]] = np.inf
     skew_errors = _jackknife(between_without, between)
     turned = _jackknife(np.rad2deg(_rotations(without)[0] - rotation), rotation)
-    skew, skew_error = float(np.abs(between).max()), float(np.linalg.norm(skew_errors))
     return RelativeResponse(
         first=sensors[0],
         second=sensors[1],
@@ -406,13 +413,11 @@ def _response(
         rotation_deg=rotation_deg,
         horizontal_deg=float("nan") if horizontal is None else horizontal_deg,
         angle_error_deg=_angle_error(len(weight), left, right, without, horizontal),
-        rotation_error_deg=math.hypot(
-            float(np.linalg.norm(turned) / math.sqrt(2)), math.sqrt(max(skew**2 - skew_error**2, 0))
-        ),
+        rotation_error_deg=float(np.linalg.norm(turned) / math.sqrt(2)),
         gains=gains,
         gain_errors=gain_errors,
-        nonorthogonality_deg=skew,
-        nonorthogonality_error_deg=skew_error,
+        nonorthogonality_deg=float(np.abs(between).max()),
+        nonorthogonality_error_deg=float(np.linalg.norm(skew_errors)),
         reversed_channels=tuple(np.flatnonzero(is_reversed).tolist()),
         delay=delay,
         delay_error=delay_error,

@@ -153,7 +153,7 @@ def response_cells(pair: RelativeResponse) -> tuple[str, str, list[str], str, st
     Angles are in degrees, the delay in microseconds.
     """
     return (
-        measured(pair.rotation_deg, NORMAL_95 * pair.rotation_error_deg, 3),
+        measured(pair.rotation_deg, NORMAL_95 * pair.rotation_uncertainty_deg, 3),
         measured(pair.horizontal_deg, NORMAL_95 * pair.angle_error_deg, 3),
         [
             measured(gain, NORMAL_95 * error, 4)

@@ -190,7 +190,7 @@ def _compared(estimate: Estimate) -> Iterator[PairCompared]:
             coherence=coherence,
             coherence_error=error,
             rotation=pair.rotation_deg if turns else math.nan,
-            rotation_error=pair.rotation_error_deg if turns else math.nan,
+            rotation_error=pair.rotation_uncertainty_deg if turns else math.nan,
             gains=tuple(pair.gains.tolist()),
             gain_errors=tuple(pair.gain_errors.tolist()),
             delay=pair.delay,

@@ -190,7 +190,7 @@ def test_unequal_gains_of_the_first_sensor_are_in_the_error_of_the_rotation() ->
         turned = Rotation.random(random_state=seed)
         found = between(bench([np.diag([1.1, 0.95, 1.0]), turned.as_matrix().T, np.eye(3)]))
         off = abs(found.rotation_deg - np.rad2deg(turned.magnitude()))
-        assert found.reversed_channels or off < 2 * found.rotation_error_deg < 20
+        assert found.reversed_channels or off < 2 * found.rotation_uncertainty_deg < 20
 
 
 @pytest.mark.parametrize(("dims", "snr", "every"), [((1, 1, 1), 5.0, 8), ((3, 3, 3), 7.0, 1)])
