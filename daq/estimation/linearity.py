@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -100,30 +99,35 @@ def nonlinear_channels(
 
 def _bends(passes: Sequence[Pass], sensor: IntArray) -> FloatArray:
     """Return what `SquaresAndCubes.bends` does, of all segments, up to `_MOST_OF_ALL`."""
-    welch, total = passes[0].welch, sum(each.n_seen for each in passes)
+    welch = passes[0].welch
     more = max(MOST_BINS, MOST_VALUES // (_TOGETHER * len(sensor)))
     usable = min(each.aligned.usable for each in passes)
     tested = SquaresAndCubes(welch, usable, more=more, most_values=0)
     hop = max(welch.hop, welch.segment_length // 2)  # more of an overlap tells little more
-    for each in passes:
-        last = max(each.n_seen - 1, 0) * welch.hop
-        wanted = min(last // hop + 1, round(_MOST_OF_ALL * each.n_seen / max(total, 1)))
-        starts = np.linspace(0, last, wanted).astype(np.int64)
-        for some in np.array_split(starts, math.ceil(wanted / _TOGETHER) or 1):
-            for samples, _ in each.whole_segments(some):
-                tested.add(samples)
-            tested.gather(sensor)
+    for samples, _ in _segments(passes, _MOST_OF_ALL, hop):
+        tested.add(samples)
+        tested.gather(sensor, least=_TOGETHER)
     return tested.bends(sensor)
 
 
 def _add_segments(tested: SquaresAndCubes, passes: Sequence[Pass], sensor: IntArray) -> None:
-    total, welch = sum(each.n_seen for each in passes), passes[0].welch
-    for each in passes:
-        n_apart = max(0, (each.n_seen - 1) * welch.hop // welch.segment_length + 1)
-        wanted = min(n_apart, round(MOST_SEGMENTS * each.n_seen / max(total, 1)))
-        last = max(each.n_seen - 1, 0) * welch.hop
-        for samples, past in each.whole_segments(np.linspace(0, last, wanted).astype(np.int64)):
-            tested.add(samples, past[sensor])
+    for samples, past in _segments(passes, MOST_SEGMENTS, passes[0].welch.segment_length):
+        tested.add(samples, past[sensor])
+
+
+def _segments(
+    passes: Sequence[Pass], most: int, hop: int
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield what `Pass.whole_segments` does: segments of all passes, `hop` samples apart or more.
+
+    Each has its share of the `most`, or one now and then where they are many.
+    """
+    seen = np.cumsum([0, *(each.n_seen for each in passes)])
+    shares = np.diff(np.round(most * seen / max(seen[-1], 1)).astype(np.int64))
+    for each, share in zip(passes, shares.tolist(), strict=True):
+        last = max(each.n_seen - 1, 0) * each.welch.hop
+        starts = np.linspace(0, last, min(last // hop + 1, share)).astype(np.int64)
+        yield from each.whole_segments(starts)
 
 
 def linearised(

@@ -172,11 +172,13 @@ class SquaresAndCubes:
             found.append(replace(best, explained=scale * best.explained))
         return found
 
-    def gather(self, sensor: IntArray) -> None:
-        """Take the segments into the sums of which `bends` is made, and drop them.
+    def gather(self, sensor: IntArray, *, least: int = 0) -> None:
+        """Take the segments, if they are the `least`, into the sums of `bends`, and drop them.
 
         `sensor`: of each channel.
         """
+        if len(self._spectra) < least:
+            return
         spectra, powers = np.array(self._spectra), np.array(self._powers)
         self._spectra, self._powers = [], []
         if len(spectra) < LEAST_LEFT or not len(self.bins):

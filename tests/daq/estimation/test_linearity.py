@@ -212,11 +212,11 @@ def bent(kind: str, n: int = N_SAMPLES, seed: int = 3) -> RecordingInMemory:
     return recording_of_arrays(arrays, sampling_rate=RATE)
 
 
-def gains_of(recording: RecordingInMemory, *, calibrates: bool) -> list[Budget]:
+def gains_of(*recordings: RecordingInMemory, calibrates: bool) -> list[Budget]:
     settings = Settings(segment=5.0, calibrates=calibrates)
-    return list(
-        calibrate(Result(estimate([recording], settings), settings), None).whole_band("sensitivity")
-    )
+    found = calibrate(Result(estimate(recordings, settings), settings), None)
+    assert not found.untested
+    return list(found.whole_band("sensitivity"))
 
 
 @pytest.mark.parametrize(
@@ -248,6 +248,28 @@ def test_what_may_bend_channels_is_less_in_longer_recordings() -> None:
     )
     assert long == pytest.approx(short / 6**0.5, rel=0.25)
     assert some > 2 * long
+
+
+def test_what_bends_a_channel_is_as_much_in_many_short_recordings() -> None:
+    """Of 11 segments each, of which none tells by itself."""
+    parts = [bent("dead zone", 3_000, seed) for seed in range(10)]
+    gain, _ = gains_of(*parts, calibrates=True)
+    one, _ = gains_of(bent("dead zone"), calibrates=True)
+    assert gain.expanded == pytest.approx(one.expanded, rel=0.25)
+    assert abs(gain.value - 1) < gain.expanded
+
+
+def test_each_of_very_many_recordings_tells_a_little_of_linearity() -> None:
+    """Of more than 96, the share of each was less than half a segment, and none was tested."""
+    recordings = []
+    for seed in range(120):
+        rng = np.random.default_rng([47, seed])
+        motion = 1e3 * rng.standard_normal((1000, 1))
+        arrays = {name: motion + rng.standard_normal((1000, 1)) for name in "ABC"}
+        arrays["B"] += 2e-6 * motion**2
+        recordings.append(recording_of_arrays(arrays, sampling_rate=RATE))
+    snapshot = estimate(recordings, Settings(segment=5.0))
+    assert [each.column for each in snapshot.nonlinear] == [1]
 
 
 def test_too_few_segments_tell_of_no_linearity_and_that_is_said() -> None:
