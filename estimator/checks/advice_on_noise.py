@@ -198,7 +198,8 @@ class ResponseChanges(Advice):
         Change of the gain, as a fraction of the gain before; of a turn in radians. With a band, the
         standard deviation of the response, as a fraction.
     size_error : float
-        Standard error of the size.
+        Standard error of the size; infinite where the size is a least one, as of a step within the
+        first or the last part of time.
     begin, end : float
         Seconds from the start, between which it changes; equal for a step.
     variance : float
@@ -221,9 +222,10 @@ class ResponseChanges(Advice):
         own = names.list_sensors(self.sensors)
         turn = f"{math.degrees(self.size_error):.1g}°"
         error = f" (standard error {turn if self.is_turn else percent(self.size_error)})"
+        is_sized = not _is_large_fall(self) and math.isfinite(self.size_error)
         return Words(
             f"{_response_change(self, names)}; {_remedy(self)}",
-            f"{_response_change(self, names)}{'' if _is_large_fall(self) else error}. "
+            f"{_response_change(self, names)}{error if is_sized else ''}. "
             f"Over all segments, this leaves up to {percent(self.variance)} of the motion's "
             f"PSD in the noise of {own}. Noise is estimated within parts of time where these have "
             "enough averages; intervals include what is left.",
@@ -236,14 +238,15 @@ def _response_change(advice: ResponseChanges, names: Names) -> str:
     """Return what changed, by how much and when."""
     (sensor,) = (names.sensors[number] for number in advice.sensors)
     whose = sensor if advice.channel is None else names.channels[advice.channel]
+    least = "" if math.isfinite(advice.size_error) else "at least "
     if advice.is_turn:
         and_fro = " to and fro" if advice.band is not None else ""
-        what = f"Sensor {sensor} turned{and_fro} by {ratio(math.degrees(abs(advice.size)))}°"
+        what = f"Sensor {sensor} turned{and_fro} by {least}{ratio(math.degrees(abs(advice.size)))}°"
     elif advice.band is not None:
         what = f"The response of {whose} varied by {percent(advice.size)} at {advice.where}"
     else:
         direction = "rose" if advice.size > 0 else "fell"
-        by = "more than half" if _is_large_fall(advice) else percent(abs(advice.size))
+        by = "more than half" if _is_large_fall(advice) else least + percent(abs(advice.size))
         what = f"The gain of {whose} {direction} by {by}"
     begin, end = (_clock_time(names, at) for at in (advice.begin, advice.end))
     when = f"at {begin}" if begin == end else f"from {begin} to {end}"

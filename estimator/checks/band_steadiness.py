@@ -220,6 +220,7 @@ class BandSteadiness:
             error=size * math.sqrt(degrees / 2) / (statistic - degrees),
             statistic=statistic,
             degrees=degrees,
+            is_least=False,
         )
 
     @property

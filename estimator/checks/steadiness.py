@@ -550,6 +550,8 @@ class ResponseChange:
         Chi-squared statistic of the test, and its degrees of freedom.
     band : (float, float) or None
         Frequencies that alone show it, Hz: `size` is then the standard deviation of a response.
+    is_least : bool
+        Whether it is larger if it is within the first or the last part of time, as it may be.
     """
 
     sensor: int
@@ -562,10 +564,16 @@ class ResponseChange:
     statistic: float
     degrees: float
     band: tuple[float, float] | None = None
+    is_least: bool = False
 
     @property
     def uncertainty(self) -> float:
-        """Standard uncertainty of the size: of a linear fit, beside that of the date."""
+        """Standard uncertainty of the size: of a linear fit, beside that of the date.
+
+        Infinite where the size is a least one.
+        """
+        if self.is_least:
+            return math.inf
         return math.hypot(self.error, LINEAR * self.size**2, DATED * self.size)
 
 
@@ -605,7 +613,9 @@ class _Course:
 def _courses(begin: FloatArray, end: FloatArray) -> list[_Course]:
     """Return steps, also within parts, and ramps over several parts."""
     n, place, found = len(begin), np.arange(len(begin)), []
-    for at in range(1, n):  # within the first part, any step is one at its end, and larger
+    for at in range(
+        1, n
+    ):  # within the first or last part, any step is one at its border, and larger
         first, last = float(begin[at]), float(end[at])
         found.append(_Course(first, first, np.array([place >= at], np.float64)))
         if at < n - 1:
@@ -675,6 +685,7 @@ def response_change(
         end=course.end,
         statistic=statistic,
         degrees=degrees,
+        is_least=course.begin == course.end and not end[0] < course.begin < begin[-1],
     )
 
 

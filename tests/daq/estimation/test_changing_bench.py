@@ -85,6 +85,19 @@ def changes(snapshot: Snapshot) -> list[ResponseChanges]:
     return [each for each in snapshot.diagnostics.advice if isinstance(each, ResponseChanges)]
 
 
+@pytest.mark.parametrize("at", [0.02, 0.985])
+def test_a_step_near_an_end_of_the_recording_has_a_least_size(at: float) -> None:
+    """Within the first or the last part of time, its place and so its size are not known."""
+    samples = recorded("", 1, 1e6)
+    samples["B"][round(at * N) :] *= 1.05
+    snapshot = huddle.self_noise(samples, fs=RATE, segment="5s").snapshot
+    (change,) = changes(snapshot)
+    assert 0 < change.size < 0.04
+    assert change.size_error == np.inf
+    assert "rose by at least" in change.words(snapshot.names).line
+    assert "standard error" not in str(change.words(snapshot.names))
+
+
 @pytest.mark.parametrize(
     ("kind", "size", "words"),
     [

@@ -143,6 +143,7 @@ EXAMPLES: tuple[Advice, ...] = (
     replace(CHANGED, channel=None, is_turn=True, size=8.7e-4, begin=100.0, end=300.0),
     replace(CHANGED, channel=None, is_turn=True, size=2.5, begin=100.0, end=100.0),
     replace(CHANGED, channel=None, size=-1.3, size_error=0.1, variance=0.2),
+    replace(CHANGED, size_error=float("inf")),
     replace(CHANGED, band=(0.4, 0.8), channel=None, size=0.03, variance=9e-4),
     replace(CHANGED, band=(0.0, 50.0), size=0.03, begin=0.0, end=900.0),
     replace(CHANGED, band=(0.0, 50.0), channel=None, is_turn=True, size=0.02, begin=0.0),
