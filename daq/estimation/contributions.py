@@ -136,29 +136,37 @@ def contributions(snapshot: Snapshot, method: str) -> tuple[Contribution, ...]:
 
 
 @once
-def leaks(snapshot: Snapshot, low: float = 0.0, high: float = math.inf) -> float:
-    """Return the largest share of a channel's noise that leakage may be in a band, or beside it.
+def leaks(
+    snapshot: Snapshot,
+    low: float = 0.0,
+    high: float = math.inf,
+    columns: tuple[int, ...] = (),
+    quantile: float = 0.5,
+) -> float:
+    """Return the largest share of a channel's noise that leakage may be in a band: of all, or some.
 
-    By thirds of an octave, twice what is predicted; zero where no leakage is named, infinite where
-    it may be all. Beside it, for those of a third scatter; of all thirds for the lowest and the top
-    ones, where responses are hardly known.
+    Twice what is predicted; zero where no leakage is named, infinite where it may be all. By thirds
+    of an octave, each with those beside it, for the former scatter, or with all for the lowest and
+    the top ones, where responses are hardly known; the median, or another quantile, in the band.
     """
     edges, frequency = snapshot.diagnostics.edge_leakage, snapshot.frequency
     named = any(isinstance(each, UnequalResponses) for each in snapshot.diagnostics.advice)
     if edges is None or not snapshot.results or not named:
         return 0.0
     noise = np.nan_to_num(np.abs(next(iter(snapshot.results.values())).noise_psd))
-    number = blocks_of(frequency)
-    near = np.ones(len(number), np.bool_)
-    inside = number[(frequency >= low) & (frequency <= high)]
-    if len(inside) and inside[0] > 0 and high <= USABLE * frequency[-1]:
-        near = (number >= inside[0] - 1) & (number <= inside[-1] + 1)
+    first = np.flatnonzero(np.diff(blocks_of(frequency), prepend=-1))
     leakage = np.where(noise > 0, edges.most, 0.0)
-    leakage, noise = (_by_block(frequency, each)[near] for each in (leakage, noise))
+    leakage, noise = (np.add.reduceat(each, first) for each in (leakage, noise))
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.fmax(np.nan_to_num(leakage / noise), edges.share[near])
-    most = float(share.max(initial=0.0))
-    return math.inf if most > MUCH_LEAKS else most / MUCH_LEAKS
+        share = np.fmax(np.nan_to_num(leakage / noise), np.maximum.reduceat(edges.share, first))
+    share = share[:, list(columns) or slice(None)]
+    beside = np.pad(share, ((1, 1), (0, 0)))
+    most = np.maximum(np.maximum(beside[:-2], share), beside[2:])
+    last = np.append(frequency[first[1:] - 1], frequency[-1])
+    most[(first == 0) | (last > USABLE * frequency[-1])] = share.max(axis=0)
+    inside = (last >= low) & (frequency[first] <= high)
+    found = float(np.quantile(most[inside if inside.any() else ...], quantile, axis=0).max())
+    return math.inf if found > MUCH_LEAKS else found / MUCH_LEAKS
 
 
 def is_untested(snapshot: Snapshot) -> bool:

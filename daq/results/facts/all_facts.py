@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
     for each in map(partial(_or_two_alone, snapshot), advice):
         if isinstance(each, Gain) and any(_explains(change, each) for change in changed):
             continue
-        if _is_leakage(each, leaks(snapshot, *each.band or ())):
+        if _is_leakage(each, snapshot):
             continue
         kinds.setdefault((type(each), is_outside(each.band, asked)), []).append(each)
     ranks, names = list(Rank), snapshot.sensor_names
@@ -116,22 +117,28 @@ def _findings(snapshot: Snapshot, asked: tuple[float, float] | None) -> Iterator
         )
 
 
-def _is_leakage(advice: Advice, most: float) -> bool:
-    """Whether leakage of up to `most` of the noise looks like this fault.
+def _is_leakage(advice: Advice, snapshot: Snapshot) -> bool:
+    """Whether leakage into the channels that it names, or any, looks like this fault.
 
     Leakage differs between sensors, is felt by several, and follows the motion.
     """
+    columns: tuple[int, ...] = ()
+    quantile = 0.5
     match advice:
         case ModelMisfit():
             share = advice.unexplained
         case SharedNoise():
             share = max(abs(each) for each in advice.coherencies)
+            columns = tuple(sorted({*chain.from_iterable(advice.channels + advice.alternatives)}))
         case NoiseChanges():  # most, if all of it is in one part
             share = advice.deviation / math.sqrt(advice.n_parts)
-        case DisturbedSegments():
+            columns = (advice.channel,)
+        case DisturbedSegments():  # at the frequencies with the largest excess
             share = advice.excess
+            columns, quantile = (advice.channel,), 1.0
         case _:
             return False
+    most = leaks(snapshot, *advice.band or (0.0, math.inf), columns, quantile)
     return math.isinf(most) or share <= most
 
 

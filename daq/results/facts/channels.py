@@ -443,14 +443,13 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 most.append(median(one.most[here] / noise[here, one.column]))
         band = (min(e.band[0] for e in of_sensor), max(e.band[1] for e in of_sensor))
-        if max(most) <= leaks(snapshot, *band):
+        columns = tuple(sorted({each.column for each in of_sensor}))
+        if max(most) <= leaks(snapshot, *band, columns, 1.0):  # in any of its thirds of an octave
             continue
         yield NoiseDependsOnMotion(
             rank=Rank.TO_KNOW if max(most) <= MUCH_NONLINEAR else Rank.DELAYS,
             sensors=(sensor,),
-            channels=tuple(
-                snapshot.channels[column].name for column in sorted({e.column for e in of_sensor})
-            ),
+            channels=tuple(snapshot.channels[column].name for column in columns),
             band=band,
             form=first.form,
             evidence=first.evidence,

@@ -199,8 +199,11 @@ def _shared_by_two(snapshot: Snapshot) -> Iterator[SharedByTwo]:
     for pair in dict.fromkeys(pair for choice in choices for pair in choice.pairs):
         here = [choice for choice in choices if pair in choice.pairs]
         instead = dict.fromkeys(other for choice in here for other in choice.alternatives)
-        least = np.min([np.array(choice.least)[np.isin(sensor, pair)] for choice in here])
-        if 1 - least <= leaks(snapshot):  # what leaks into two sensors alike, no third one feels
+        own = np.isin(sensor, pair)
+        least = np.min([np.array(choice.least)[own] for choice in here])
+        columns = tuple(np.flatnonzero(own).tolist())
+        leaking = max(leaks(snapshot, choice.low, choice.high, columns) for choice in here)
+        if 1 - least <= leaking:  # what leaks into two sensors alike, no third one feels
             continue
         yield SharedByTwo(
             rank=Rank.DELAYS,

@@ -152,8 +152,12 @@ def _in_gusts(estimate: Estimate) -> Iterator[NoiseInGusts]:
     with np.errstate(invalid="ignore", divide="ignore"):
         wider = np.divide(*(np.diff(each)[:, 0] for each in ends)) - 1
     wider = np.nan_to_num(wider, posinf=0.0)
-    some = [n for n in np.argsort(-wider).tolist() if wider[n] > MUCH_WIDER]
-    if some and loudness.size[some[0]] > leaks(snapshot):
+    some = [
+        n
+        for n in np.argsort(-wider).tolist()
+        if wider[n] > MUCH_WIDER and loudness.size[n] > leaks(snapshot, *estimate.band, (n,))
+    ]
+    if some:
         yield NoiseInGusts(
             rank=Rank.TO_KNOW,
             channels=tuple(snapshot.channels[n].name for n in some),

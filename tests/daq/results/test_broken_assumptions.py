@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 
 from daq.estimation.contributions import by_two, leaks
 from daq.estimation.estimation import estimate
@@ -11,10 +12,11 @@ from daq.estimation.settings import Settings
 from daq.estimation.snapshot import Snapshot
 from daq.formats.arrays import recording_of_arrays
 from daq.results.facts.fact import Finding
+from daq.results.facts.precision import NoiseInGusts
 from daq.results.result import Result
 from estimator.checks.advice import Rank
 from estimator.checks.advice_on_model import ModelMisfit
-from estimator.checks.advice_on_noise import SharedNoise
+from estimator.checks.advice_on_noise import NoiseChanges, SharedNoise
 
 RATE, N_SAMPLES = 100.0, 24_000
 SETTINGS = Settings(segment=2.0)
@@ -233,3 +235,21 @@ def test_noise_that_two_sensors_share_is_named_beside_less_leakage() -> None:
     snapshot = estimated(motion, noise)
     assert 0.1 < leaks(snapshot) < 0.5
     assert facts_that_delay(snapshot) == {"UnequalResponses", "SharedByTwo"}
+
+
+def test_noise_of_like_sensors_that_changes_is_named_beside_leakage_of_another() -> None:
+    """It leaks into the other sensor alone, and in the lowest third of an octave alone."""
+    noise = np.random.default_rng(3).standard_normal((3, 120_000, 3))
+    noise[1, 60_000:] *= 2
+    rng = np.random.default_rng(1)
+    motion = [100.0 * rng.standard_normal((120_000, 3))] * 3
+    motion[0] = lfilter(*butter(1, 0.05, "high", fs=RATE), motion[0], axis=0)
+    samples = {f"s{n}": each + own for n, (each, own) in enumerate(zip(motion, noise, strict=True))}
+    settings = Settings(segment=20.0, band=(0.5, 40.0))
+    snapshot = estimate([recording_of_arrays(samples, RATE)], settings)
+    assert leaks(snapshot, 0.0, 1.0, (0, 1, 2)) > 1  # all of it
+    facts = Result(snapshot, settings).facts
+    named = [each for fact in facts if isinstance(fact, Finding) for each in fact.findings]
+    assert {each.sensors for each in named if isinstance(each, NoiseChanges)} == {(1,)}
+    (gusts,) = (fact for fact in facts if isinstance(fact, NoiseInGusts))
+    assert {each.split(".")[0] for each in gusts.channels} == {"s1"}
