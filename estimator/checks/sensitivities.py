@@ -185,13 +185,15 @@ def _both_ways(response: RelativeResponse) -> list[tuple[tuple[int, int], _Gains
 
 
 def _mean(several: Sequence[_Gains]) -> _Gains:
-    """Return the geometric mean of gains against several sensors.
+    """Return the geometric mean of gains against several sensors, of the known ones if there are.
 
     Its error is not reduced by their number: all share the motion that the sensor did not see well.
     """
-    gains = np.exp(np.mean([np.log(each.gains) for each in several], axis=0))
-    errors = np.array([each.errors / each.gains for each in several], np.float64)
-    return _Gains(gains, np.min(errors, axis=0) * gains)
+    gains, errors = (np.array([getattr(each, of) for each in several]) for of in _Gains.__slots__)
+    known = CERTAIN * errors <= gains
+    known |= ~known.any(axis=0)
+    mean = np.exp(np.mean(np.log(gains), axis=0, where=known))
+    return _Gains(mean, np.min(errors / gains, axis=0) * mean)
 
 
 def _majority(agreeing: dict[int, set[int]]) -> set[int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -63,6 +65,20 @@ def test_a_whole_sensor_is_named_and_its_certificate_is_believed() -> None:
     certified = found_in(wrong, certified=(6, 7, 8))
     assert [each.channel for each in certified] == [0, 1, 2, 3, 4, 5]
     assert {each.against for each in certified} == {(2,)}
+
+
+def test_sensors_are_not_doubted_for_a_gain_that_is_not_known() -> None:
+    """The phase of the first sensor turns over the band: of its sums, little is left."""
+    late = np.exp(2j * np.pi * FREQUENCY / 100)
+    turn = np.ones((12, 100), np.complex128)
+    turn[:3] = (late**-2 + 0.49) / (1 + 0.49 * late**-2)  # an all-pass
+    true = np.tile(1e4 * np.eye(3), (4, 4)) + np.eye(12)
+    csm = wishart(turn.T[:, :, None] * true * turn.T[:, None].conj(), 60, np.random.default_rng(1))
+    responses = [
+        relative_response(csm[0], FREQUENCY, dims=(3,) * 4, first=i, second=j)
+        for i, j in combinations(range(4), 2)
+    ]
+    assert wrong_gains(responses, (3,) * 4) == ()
 
 
 def test_where_no_majority_agrees_every_sensor_is_doubted() -> None:
