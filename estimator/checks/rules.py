@@ -31,7 +31,7 @@ from estimator.checks.shared_noise import SharedPairs
 from estimator.likelihood.goodness_of_fit import less, rejected_below
 from estimator.self_noise.coherency import Coherency, presence
 from estimator.self_noise.result import Flag
-from estimator.types import FloatArray
+from estimator.types import BoolArray, FloatArray
 
 ROTATED_DEG = 0.5
 SKEWED_DEG = 2.0
@@ -41,6 +41,8 @@ DELAY_SAMPLES = 0.1
 CERTAIN = 5.0
 """Standard errors that a deviation must exceed as well. The errors come from the scatter of eight
 parts of the band, and every pair of sensors is examined."""
+PARALLEL = 0.9
+"""Cosine to its counterpart from which the sign of a channel tells polarity, without the others."""
 
 
 def _swapped(response: RelativeResponse) -> dict[int, int]:
@@ -60,6 +62,17 @@ def _swapped(response: RelativeResponse) -> dict[int, int]:
     return {c: int(follows[c]) for c in moved}
 
 
+def _reversed(response: RelativeResponse, unknown: BoolArray) -> list[int]:
+    """Return the reversed channels: if some are unknown, of two or more that are not turned."""
+    if not unknown.any():
+        return list(response.reversed_channels)
+    known = np.flatnonzero(~unknown)
+    along = (np.diag(response.matrix) / response.gains)[known]
+    if len(known) < 2 or (np.abs(along) < PARALLEL).any() or np.prod(along) > 0:
+        return []
+    return [int(channel) for channel in known[along < 0]]
+
+
 def orientation(
     response: RelativeResponse, dims: tuple[int, ...], nyquist: float
 ) -> Iterator[Advice]:
@@ -68,8 +81,9 @@ def orientation(
     band = (response.low, response.high)
     counterpart, own = (sum(dims[:sensor]) for sensor in pair)
     unknown = CERTAIN * response.gain_errors > response.gains  # what is summed cancels
-    has_sign = not response.is_ambiguous and not unknown.any()
-    swapped = _swapped(response) if has_sign else {}
+    has_sign = not response.is_ambiguous
+    is_whole = has_sign and not unknown.any()
+    swapped = _swapped(response) if is_whole else {}
     if swapped:
         yield advice_on_sensors.SwappedChannels(
             rank=Rank.DELAYS,
@@ -78,7 +92,7 @@ def orientation(
             channels=tuple((own + c, counterpart + other) for c, other in swapped.items()),
         )
         return
-    if has_sign and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
+    if is_whole and _exceeds(response.rotation_deg, ROTATED_DEG, response.rotation_error_deg):
         yield advice_on_sensors.Rotated(
             rank=Rank.TO_KNOW,
             sensors=pair,
@@ -96,7 +110,7 @@ def orientation(
             band=band,
             deviation_deg=skew,
         )
-    for channel in response.reversed_channels if has_sign else ():
+    for channel in _reversed(response, unknown) if has_sign else ():
         yield advice_on_sensors.ReversedPolarity(
             rank=Rank.DELAYS,
             sensors=pair,
@@ -117,7 +131,7 @@ def orientation(
             ratio=float(response.gains[off]),
         )
     samples = response.delay * 2 * nyquist
-    if has_sign and _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
+    if is_whole and _exceeds(abs(samples), DELAY_SAMPLES, response.delay_error * 2 * nyquist):
         yield advice_on_sensors.Delay(
             rank=Rank.DELAYS,
             sensors=pair,

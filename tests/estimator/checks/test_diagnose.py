@@ -207,6 +207,16 @@ def test_a_channel_whose_phase_turns_over_the_band_is_neither_weak_nor_reversed(
         assert not advice_of(ReversedPolarity, found)
 
 
+def test_a_reversed_channel_is_named_beside_one_whose_phase_turns() -> None:
+    late = np.ones((len(FREQUENCY), 9), np.complex128)
+    late[:, 4] = np.exp(-2j * np.pi * FREQUENCY * 0.1)
+    csm = bench(np.eye(3), np.diag([-1.0, 1, 1]), np.eye(3))
+    for seed in range(4):
+        found = of(averages(csm * late[:, :, None] * late[:, None].conj(), seed=seed))
+        named = {(each.counterpart, each.channel) for each in advice_of(ReversedPolarity, found)}
+        assert named == {(0, 3)}
+
+
 @pytest.mark.parametrize(
     ("angle_deg", "level"), [(5.7, Rank.TO_KNOW), (25.0, Rank.DELAYS)], ids=["some", "much"]
 )
