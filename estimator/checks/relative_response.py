@@ -579,13 +579,17 @@ def _parts(weight: FloatArray) -> IntArray:
 def _jackknife(without: FloatArray, like: FloatArray) -> FloatArray:
     """Return standard errors from estimates that leave out one part each; NaN without any.
 
-    They are of few parts: 1.96 of them are Student's interval of 95 % (expansion by Fisher).
+    They are of few parts: 1.96 of them are Student's interval of 95 %.
     """
     n = len(without)
     if not n:
         return np.full(like.shape, np.nan)
-    student = 1 + 1.21 / (n - 1) + 1.44 / (n - 1) ** 2
-    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1) * student)
+    return np.asarray(np.std(without, axis=0) * math.sqrt(n - 1) * _student(n))
+
+
+def _student(n: int) -> float:
+    """Return by how much more 1.96 standard errors of `n` parts are (expansion by Fisher)."""
+    return 1 + 1.21 / (n - 1) + 1.44 / (n - 1) ** 2
 
 
 def _coarse_delay(f: FloatArray, transfer: ComplexArray) -> float:
@@ -680,5 +684,5 @@ def _angle_error(
         return math.nan
     whole = n == _PARTS
     angles = _angles(_over(left, right).real if whole else without, horizontal)
-    scatter = float(angles.std(axis=0, ddof=1).max())
+    scatter = float(angles.std(axis=0, ddof=1).max()) * _student(n)
     return scatter / math.sqrt(n) if whole else scatter * (n - 1) / math.sqrt(n)
