@@ -155,7 +155,7 @@ def leaks(
         return 0.0
     noise = np.nan_to_num(np.abs(next(iter(snapshot.results.values())).noise_psd))
     first = np.flatnonzero(np.diff(blocks_of(frequency), prepend=-1))
-    leakage = np.where(noise > 0, edges.most, 0.0)
+    leakage = np.where(noise > 0, edges.of_responses, 0.0)
     leakage, noise = (np.add.reduceat(each, first) for each in (leakage, noise))
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.fmax(np.nan_to_num(leakage / noise), np.maximum.reduceat(edges.share, first))

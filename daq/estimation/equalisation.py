@@ -328,14 +328,13 @@ class Equalisation:
         share = np.concatenate([_unseen(band) for band in bands])[:, None]
         unseen = share * np.maximum(whole.left, 0.0) * (self.filters is not None)
         unseen += _FROM_AFAR * np.maximum(found.left, 0.0) * self._jumps
-        unseen += np.concatenate(
-            [_of_trends(*each) for each in zip(bands, found.noise, strict=True)]
-        )
+        trends = [_of_trends(*each) for each in zip(bands, found.noise, strict=True)]
         with np.errstate(divide="ignore", invalid="ignore"):  # responses vanish at 0 Hz
             return EdgeLeakage(
                 left=found.left * scale,
                 whole=np.maximum(whole.left, found.left) * scale,
                 unseen=np.where(np.isfinite(scale), unseen * scale, 0.0),
+                trends=np.where(np.isfinite(scale), np.concatenate(trends) * scale, 0.0),
                 share=found.share,
                 whole_share=np.maximum(whole.share, found.share),
                 sources=self.sources,

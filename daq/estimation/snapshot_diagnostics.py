@@ -81,8 +81,9 @@ class EdgeLeakage:
     whole : float64, shape (n_freqs, n_channels)
         The same without equalisation.
     unseen : float64, shape (n_freqs, n_channels)
-        What equalisation may have left that averages do not show, windows that jump, or trends of
-        the noise within segments; likewise.
+        What equalisation may have left that averages do not show, or windows that jump; likewise.
+    trends : float64, shape (n_freqs, n_channels)
+        What trends of the noise within segments may leak; likewise.
     share, whole_share : float64, shape (n_freqs, n_channels)
         What the first two are at least, over the noise estimate, in bands of third octaves.
     sources : tuple of str
@@ -96,6 +97,7 @@ class EdgeLeakage:
     left: FloatArray = field(metadata={"key": "left_psd"})
     whole: FloatArray = field(metadata={"key": "without_equalisation_psd"})
     unseen: FloatArray = field(metadata={"key": "unseen_psd"})
+    trends: FloatArray = field(metadata={"key": "trends_psd"})
     share: FloatArray = field(metadata={"key": "left_share"})
     whole_share: FloatArray = field(metadata={"key": "without_equalisation_share"})
     sources: tuple[str, ...] = ()
@@ -104,6 +106,11 @@ class EdgeLeakage:
     @property
     def most(self) -> FloatArray:
         """What may be in the noise PSD at most, shape (n_freqs, n_channels)."""
+        return self.of_responses + self.trends
+
+    @property
+    def of_responses(self) -> FloatArray:
+        """The same without what trends of the noise may leak."""
         found = PREDICTED_WITHIN * np.maximum(self.left, 0.0) + self.unseen
         return np.where(np.isfinite(found), found, 0.0)
 
