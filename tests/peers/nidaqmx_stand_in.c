@@ -95,9 +95,10 @@ static double volts(uint64_t n, int channel) {
 void si_unplug(int now_unplugged) { is_unplugged = now_unplugged; }
 void si_hang(double seconds) { hangs = seconds; } /* of the next read */
 
-void si_hold(int hold) { /* an external sample clock pauses */
+void si_hold(int hold) { /* an external sample clock pauses, never at the end of what was read */
     pthread_mutex_lock(&lock);
-    begin(acquired(si_task));
+    uint64_t n = acquired(si_task), least = si_task->position + 100 * (hold != 0);
+    begin(n < least ? least : n);
     is_held = hold;
     pthread_mutex_unlock(&lock);
 }
