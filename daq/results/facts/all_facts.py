@@ -139,7 +139,7 @@ def _is_leakage(advice: Advice, snapshot: Snapshot) -> bool:
         case _:
             return False
     most = leaks(snapshot, *advice.band or (0.0, math.inf), columns, quantile)
-    return math.isinf(most) or share <= most
+    return most > 0 and share <= most
 
 
 def _explains(change: ResponseChanges, gain: Gain) -> bool:

@@ -444,7 +444,8 @@ def facts_of_linearity(snapshot: Snapshot) -> Iterator[Fact]:
                 most.append(median(one.most[here] / noise[here, one.column]))
         band = (min(e.band[0] for e in of_sensor), max(e.band[1] for e in of_sensor))
         columns = tuple(sorted({each.column for each in of_sensor}))
-        if max(most) <= leaks(snapshot, *band, columns, 1.0):  # in any of its thirds of an octave
+        leaking = leaks(snapshot, *band, columns, 1.0)  # in any of its thirds of an octave
+        if leaking > 0 and max(most) <= leaking:
             continue
         yield NoiseDependsOnMotion(
             rank=Rank.TO_KNOW if max(most) <= MUCH_NONLINEAR else Rank.DELAYS,

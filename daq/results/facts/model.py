@@ -203,7 +203,8 @@ def _shared_by_two(snapshot: Snapshot) -> Iterator[SharedByTwo]:
         least = np.min([np.array(choice.least)[own] for choice in here])
         columns = tuple(np.flatnonzero(own).tolist())
         leaking = max(leaks(snapshot, choice.low, choice.high, columns) for choice in here)
-        if 1 - least <= leaking:  # what leaks into two sensors alike, no third one feels
+        # what leaks into two sensors alike, no third one feels
+        if leaking > 0 and 1 - least <= leaking:
             continue
         yield SharedByTwo(
             rank=Rank.DELAYS,
