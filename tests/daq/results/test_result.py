@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
 from daq.estimation import contributions
 from daq.results import band_summary, result, standing
 from daq.results.decision import limits
+from daq.results.facts.fact import Finding
 from daq.results.result import Result
+from estimator.checks.advice import Rank
+from estimator.checks.advice_on_noise import DisturbedSegments
 from tests.daq.results.decision.benches import bench_with
 from tests.tui.example_snapshot import SETTINGS, diagnosed
 from tui.commands.estimate import show_result
@@ -57,3 +61,20 @@ def test_means_of_a_band_are_made_once() -> None:
     found = Result(diagnosed(), SETTINGS)
     assert found.means("three-sensor") is found.means("three-sensor", found.band)
     assert found.means("three-sensor", (2.0, 3.0)) is not found.means("three-sensor")
+
+
+def test_segments_that_lower_the_noise_are_disturbed_where_nothing_leaks() -> None:
+    """Without leakage, less than no excess was taken for leakage, and not said."""
+    snapshot = diagnosed()
+    disturbed = DisturbedSegments(
+        rank=Rank.DELAYS, sensors=(1,), n_disturbed=7, n_segments=240, times=(295.0,),
+        excess=-0.1, channel=4,
+    )  # fmt: skip
+    found = snapshot.diagnostics.diagnosis
+    assert found is not None
+    found = replace(found, advice=(*found.advice, disturbed))
+    changed = replace(snapshot, diagnostics=replace(snapshot.diagnostics, diagnosis=found))
+    facts = Result(changed, SETTINGS).facts
+    assert disturbed in [
+        each for fact in facts if isinstance(fact, Finding) for each in fact.findings
+    ]
